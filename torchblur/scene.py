@@ -1,0 +1,182 @@
+"""Scene: moving triangle meshes, what they are made of, the camera and the background.
+
+Before: camera.py.  After: prisms.py (the exposure), instant.py (one instant).
+Symbols: V vertices, F faces, K segments of a motion (K+1 knots at equally spaced shutter times).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchblur import check
+from torchblur.camera import Camera, lerp_knots
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What a mesh is made of: straight (not premultiplied) linear colour and opacity, constant or per face.
+
+    Args:
+        color: (3,) or (F, 3) linear RGB, at least 0; above 1 is light that outshines white.
+        opacity: a number or (F,), in [0, 1].
+        double_sided: show back faces too; otherwise only faces whose vertices turn counter-clockwise on screen,
+            decided exactly in time.
+
+    Raises:
+        TypeError, ValueError: wrong shape or type, NaN, inf, or out of range.
+    """
+
+    color: Any = (0.8, 0.8, 0.8)
+    opacity: Any = 1.0
+    double_sided: bool = True
+
+    def __post_init__(self) -> None:
+        color = check.floats("color", self.color, (3,), ("F", 3))
+        if (color.detach() < 0).any():
+            raise check.fail("color", "values of at least 0", f"{float(color.detach().min())}")
+        opacity = check.unit_range("opacity", check.floats("opacity", self.opacity, (), ("F",)))
+        if not isinstance(self.double_sided, bool):
+            raise check.fail_type("double_sided", "True or False", self.double_sided)
+        object.__setattr__(self, "color", color)
+        object.__setattr__(self, "opacity", opacity)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh, static or with vertices that move linearly between knots.
+
+    Args:
+        vertices: (V, 3) static, or (K+1, V, 3) at equally spaced shutter times [scene units], float32 or float64.
+        faces: (F, 3) integers in [0, V).
+        material: colour, opacity, sides; per-face values must be F long.
+        name: for messages and metadata.
+
+    Raises:
+        TypeError, ValueError: a wrong argument, named.
+
+    Example:
+        >>> square = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
+        >>> Mesh(torch.tensor(square, dtype=torch.float32), [[0, 1, 2], [0, 2, 3]]).n_faces
+        2
+    """
+
+    vertices: Any
+    faces: Any
+    material: Material = field(default_factory=Material)
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):
+            raise check.fail_type("name", "a str", self.name)
+        vertices = check.floats("vertices", self.vertices, ("V", 3), ("K+1", "V", 3))
+        if vertices.ndim == 3 and len(vertices) < 2:
+            raise check.fail("vertices", "(V, 3), or (K+1, V, 3) with at least 2 knots", vertices)
+        given = self.faces
+        if not isinstance(given, Tensor) and not hasattr(given, "dtype"):
+            given = torch.as_tensor(given, device=vertices.device)
+            given = given.reshape(0, 3).long() if given.numel() == 0 else given
+        faces = check.indices("faces", given, ("F", 3), vertices.shape[-2])
+        if not isinstance(self.material, Material):
+            raise check.fail_type("material", "a Material", self.material)
+        color, opacity = self.material.color, self.material.opacity
+        if color.ndim == 2 and len(color) != len(faces):
+            raise check.fail("color", f"(3,) or ({len(faces)}, 3), one row a face", color)
+        if opacity.ndim == 1 and len(opacity) != len(faces):
+            raise check.fail("opacity", f"a number or ({len(faces)},), one value a face", opacity)
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def n_segments(self) -> int:
+        """Number of linear pieces of the motion; 0 if static."""
+        return len(self.vertices) - 1 if self.vertices.ndim == 3 else 0
+
+    @property
+    def n_faces(self) -> int:
+        """Number of triangles."""
+        return len(self.faces)
+
+    def vertices_at(self, t: Tensor) -> Tensor:
+        """Return (N, V, 3) float64 world positions at the shutter times `t` (N,): linear between the knots."""
+        vertices = self.vertices.to(torch.float64)
+        if vertices.ndim == 2:
+            return vertices.expand(len(t), *vertices.shape)
+        return lerp_knots(vertices, t)
+
+    def face_rgb(self) -> Tensor:
+        """Return (F, 3) float64 straight linear colour of the faces."""
+        return self.material.color.to(self.vertices.device, torch.float64).expand(self.n_faces, 3)
+
+    def face_opacity(self) -> Tensor:
+        """Return (F,) float64 opacity of the faces."""
+        return self.material.opacity.to(self.vertices.device, torch.float64).expand(self.n_faces)
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Meshes, a camera and what is behind them.
+
+    Args:
+        meshes: any number of meshes, none too.
+        camera: sees them; its device must be that of the meshes.
+        background: (3,) linear RGB, or an image (H, W, 3) the size of the camera's.
+
+    Raises:
+        TypeError, ValueError: a wrong argument, named; tensors on several devices.
+    """
+
+    meshes: Sequence[Mesh]
+    camera: Camera
+    background: Any = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        if isinstance(self.meshes, Mesh) or not all(isinstance(m, Mesh) for m in self.meshes):
+            raise check.fail_type("meshes", "a sequence of Mesh", self.meshes)
+        if not isinstance(self.camera, Camera):
+            raise check.fail_type("camera", "a Camera", self.camera)
+        object.__setattr__(self, "meshes", tuple(self.meshes))
+        h, w = self.camera.height, self.camera.width
+        background = check.floats("background", self.background, (3,), (h, w, 3))
+        if (background.detach() < 0).any():
+            raise check.fail("background", "values of at least 0", f"{float(background.detach().min())}")
+        device = self.camera.world_to_clip.device
+        named = {f"meshes[{i}].vertices": m.vertices for i, m in enumerate(self.meshes)}
+        named |= {f"meshes[{i}].faces": m.faces for i, m in enumerate(self.meshes)}
+        check.same_device(**{"camera.world_to_clip": self.camera.world_to_clip, **named})
+        for i, mesh in enumerate(self.meshes):
+            for part in ("color", "opacity"):
+                _same_device_if_large(f"meshes[{i}].material.{part}", getattr(mesh.material, part), device)
+        _same_device_if_large("background", background, device)
+        object.__setattr__(self, "background", background)
+
+    @property
+    def device(self) -> torch.device:
+        """Device of all tensors."""
+        return self.camera.world_to_clip.device
+
+    @property
+    def dtype(self) -> torch.dtype:
+        """Floating type of the results: that of the meshes' vertices (of an empty scene: float32)."""
+        dtype = torch.float32
+        for mesh in self.meshes:
+            dtype = torch.promote_types(dtype, mesh.vertices.dtype)
+        return dtype
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether anything in the scene asks for gradients."""
+        tensors = [self.camera.world_to_clip, self.background]
+        for mesh in self.meshes:
+            tensors += [mesh.vertices, mesh.material.color, mesh.material.opacity]
+        return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+
+
+def _same_device_if_large(name: str, value: Tensor, device: torch.device) -> None:
+    """Raise if an array lies on another device; a single colour or number may come from the CPU (it is a constant)."""
+    if value.device != device and (value.ndim > 1 or value.device.type != "cpu" or value.requires_grad):
+        raise check.fail(name, f"a tensor on {device}", value)

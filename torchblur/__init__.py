@@ -1,0 +1,26 @@
+"""torchblur: motion blur of moving triangle meshes, integrated exactly over the exposure, as PyTorch tensors."""
+
+from torchblur.accuracy import Accuracy
+from torchblur.camera import Camera
+from torchblur.instant import Instant, motion_to, render_instant
+from torchblur.render import Frame, render
+from torchblur.sampling import Accumulated, accumulate
+from torchblur.scene import Material, Mesh, Scene
+from torchblur.shutter import Shutter
+
+__version__ = "0.1.0"
+__all__ = [
+    "Accumulated",
+    "Accuracy",
+    "Camera",
+    "Frame",
+    "Instant",
+    "Material",
+    "Mesh",
+    "Scene",
+    "Shutter",
+    "accumulate",
+    "motion_to",
+    "render",
+    "render_instant",
+]

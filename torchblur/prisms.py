@@ -1,0 +1,202 @@
+"""Turn a scene into prisms: the clip-space triangle at both ends of each linear piece of its motion.
+
+Before: surfaces.py.  After: intervals.py.
+Symbols: P prisms, F faces of all meshes; (x, y, z, w) clip space; t shutter time; "open" and "close" are the ends of
+a prism's own slice of the exposure. Within a face the corners are stored in a canonical order (by position, then by
+time), so that two faces that share an edge compute it from the same numbers in the same order.
+Source: Ronnow et al. 2021, sec. 3 (prism); near-clipped bounds, canonical order, segments: ours.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchblur.camera import project_world
+from torchblur.scene import Mesh, Scene
+from torchblur.shutter import Shutter
+from torchblur.surfaces import Surfaces
+
+OPEN_CORNERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2))  # (end of the prism, corner)
+SAME_KNOT = 1e-12  # shutter time; knots of a mesh, the camera and the shutter closer than this are one
+BOUND_SLACK_PX = 1e-6  # widening of the bounds against rounding; far above float64 error, far below a pixel
+
+
+@dataclass(frozen=True)
+class Prisms:
+    """The moving triangles of a scene under its camera."""
+
+    clip: Tensor  # (2, 3, 4, P) float64: end (open, close), corner in canonical order, x y z w
+    t_open: Tensor  # (P,) float64 shutter time at which the prism's slice begins
+    t_close: Tensor  # (P,) float64 and ends
+    face_of: Tensor  # (P,) int64 face of the scene (all meshes end to end)
+    corner_of: Tensor  # (3, P) int64 which corner of the face is stored at each place
+    parity: Tensor  # (P,) float64, +1 where the stored corners turn as the face's do, else -1
+    is_clipped: Tensor  # (P,) bool: reaches beyond the near or the far plane
+    bounds_px: Tensor  # (4, P) float64 x0 y0 x1 y1 of the swept area on screen [px], conservative
+    surfaces: Surfaces  # what the faces look like
+    is_perspective: bool  # w is the view depth
+
+    @property
+    def count(self) -> int:
+        """Number of prisms."""
+        return len(self.face_of)
+
+
+def build_prisms(scene: Scene, surfaces: Surfaces, shutter: Shutter) -> Prisms:
+    """Return the prisms of all faces that can be seen while the shutter is open.
+
+    Args:
+        scene: meshes and camera; their motions may have different numbers of knots.
+        surfaces: of the same scene.
+        shutter: prisms are cut to its window.
+
+    Returns:
+        Prisms. Left out are only faces of opacity 0 (when opacity asks for no gradient) and prisms that lie
+        wholly outside the view. Gradient: to vertices and camera through `clip`.
+
+    Source: Ronnow et al. 2021, sec. 3; segments ours.
+    """
+    camera = scene.camera
+    parts: list[tuple[Tensor, ...]] = []
+    for i, mesh in enumerate(scene.meshes):
+        if mesh.n_faces == 0:
+            continue
+        times = knot_times(mesh, scene, shutter)
+        knots = times[:1] if mesh.n_segments == camera.n_segments == 0 else times
+        at = torch.tensor(knots, dtype=torch.float64, device=scene.device)
+        clip_vertices = project_world(mesh.vertices_at(at), camera.world_to_clip_at(at))
+        clip = clip_vertices[:, mesh.faces]  # (knots, F, 3, 4)
+        clip_open, clip_close = (clip, clip) if len(knots) == 1 else (clip[:-1], clip[1:])
+        n_segments = len(clip_open)
+        both = torch.stack([clip_open, clip_close]).flatten(1, 2).permute(0, 2, 3, 1)  # (2, 3, 4, segments * F)
+        span = torch.tensor(times, dtype=torch.float64, device=scene.device)
+        face = torch.arange(mesh.n_faces, device=scene.device) + surfaces.first_face[i]
+        parts.append(
+            (
+                both,
+                span[:-1].repeat_interleave(mesh.n_faces),
+                span[1:].repeat_interleave(mesh.n_faces),
+                face.repeat(n_segments),
+            )
+        )
+    if not parts:
+        return _assemble(scene, surfaces, *_no_prisms(scene.device))
+    return _assemble(scene, surfaces, *(torch.cat(p, dim=-1) for p in zip(*parts, strict=True)))
+
+
+def knot_times(mesh: Mesh, scene: Scene, shutter: Shutter) -> list[float]:
+    """Return the shutter times at which the linear pieces of a mesh's screen motion meet, window ends included."""
+    inner = {k / n for n in (mesh.n_segments, scene.camera.n_segments) for k in range(1, n)}
+    times = [shutter.t_open]
+    for t in sorted(inner):
+        if t - times[-1] > SAME_KNOT and shutter.t_close - t > SAME_KNOT:
+            times.append(t)
+    return [*times, shutter.t_close]
+
+
+def _no_prisms(device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    empty = torch.zeros(0, dtype=torch.float64, device=device)
+    return empty.reshape(2, 3, 4, 0), empty, empty, torch.zeros(0, dtype=torch.int64, device=device)
+
+
+def _assemble(
+    scene: Scene, surfaces: Surfaces, clip: Tensor, t_open: Tensor, t_close: Tensor, face_of: Tensor
+) -> Prisms:
+    """Put corners in canonical order, bound the swept areas, and drop what can't be seen."""
+    with torch.no_grad():
+        corner_of, parity = canonical_corners(clip)
+        near = clip[:, :, 2] + clip[:, :, 3]  # (2, 3, P): inside where >= 0
+        far = clip[:, :, 3] - clip[:, :, 2]
+        bounds = swept_bounds_px(clip, near, scene.camera.width, scene.camera.height)
+        outside = (near < 0).all(0).all(0) | (far < 0).all(0).all(0)
+        outside |= (bounds[0] > scene.camera.width) | (bounds[1] > scene.camera.height)
+        outside |= (bounds[2] < 0) | (bounds[3] < 0)
+        if not surfaces.opacity.requires_grad:
+            outside |= surfaces.opacity[face_of] == 0
+        kept = (~outside).nonzero().flatten()
+        is_clipped = ((near < 0) | (far < 0)).any(0).any(0)
+    corner_of, parity = corner_of[:, kept], parity[kept]
+    index = corner_of.reshape(1, 3, 1, -1).expand(2, 3, 4, -1)
+    return Prisms(
+        clip=clip[..., kept].gather(1, index),
+        t_open=t_open[kept],
+        t_close=t_close[kept],
+        face_of=face_of[kept],
+        corner_of=corner_of,
+        parity=parity,
+        is_clipped=is_clipped[kept],
+        bounds_px=bounds[:, kept],
+        surfaces=surfaces,
+        is_perspective=scene.camera.is_perspective,
+    )
+
+
+def canonical_corners(clip: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the order of the corners by position, (3, P) int64, and whether it turns as given (+1) or not (-1), (P,).
+
+    By position rather than by index, so that a mesh whose seams double its vertices, and two meshes that meet in one
+    edge, abut as one mesh does. Source: ours.
+    """
+    keys = clip.permute(1, 0, 2, 3).reshape(3, 8, -1)  # corner, number, prism
+    less = {(i, j): _less(keys[i], keys[j]) for i in range(3) for j in range(3) if i < j}
+    place = [
+        (~less[0, 1]).long() + (~less[0, 2]).long(),
+        less[0, 1].long() + (~less[1, 2]).long(),
+        less[0, 2].long() + less[1, 2].long(),
+    ]
+    corner_of = torch.argsort(torch.stack(place), dim=0, stable=True)
+    even = (corner_of[1] - corner_of[0]) % 3 == 1
+    return corner_of, torch.where(even, 1.0, -1.0).to(clip.dtype)
+
+
+def _less(a: Tensor, b: Tensor) -> Tensor:
+    """Return whether `a` (8, P) comes before or equals `b` number by number."""
+    first = (a != b).to(torch.uint8).argmax(0, keepdim=True)
+    return (a.gather(0, first) <= b.gather(0, first)).squeeze(0)
+
+
+def swept_bounds_px(clip: Tensor, near: Tensor, width: int, height: int) -> Tensor:
+    """Return (4, P) conservative screen bounds x0 y0 x1 y1 [px] of the swept triangles in front of the near plane.
+
+    While all six corners are in front, the swept set lies in the hull of their projections. Otherwise the hull of
+    the corners in front and of all pairwise crossings of the near plane is that set exactly.
+
+    Args:
+        clip: (2, 3, 4, P).
+        near: (2, 3, P) z + w of the corners.
+        width, height: image size [px].
+
+    Source: ours.
+    """
+    points = torch.stack([clip[e, c] for e, c in OPEN_CORNERS])  # (6, 4, P)
+    side = torch.stack([near[e, c] for e, c in OPEN_CORNERS])  # (6, P)
+    low, high = _extent_px(points, side >= 0, width, height)
+    crossing = ((side < 0).any(0) & (side >= 0).any(0)).nonzero().flatten()
+    if len(crossing):
+        p, g = points[..., crossing], side[:, crossing]
+        cut, valid = [], []
+        for i, j in itertools.combinations(range(6), 2):
+            apart = (g[i] >= 0) != (g[j] >= 0)
+            share = g[i] / torch.where(apart, g[i] - g[j], 1.0)
+            cut.append(p[i] + share * (p[j] - p[i]))
+            valid.append(apart)
+        low_cut, high_cut = _extent_px(torch.stack(cut), torch.stack(valid), width, height)
+        low[:, crossing] = torch.minimum(low[:, crossing], low_cut)
+        high[:, crossing] = torch.maximum(high[:, crossing], high_cut)
+    return torch.cat([low - BOUND_SLACK_PX, high + BOUND_SLACK_PX])
+
+
+def _extent_px(points: Tensor, valid: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
+    """Return (2, P) least and greatest screen positions of the valid (K, 4, P) points; all of it where w fails."""
+    w = points[:, 3]
+    unsafe = (valid & ~(w > 0)).any(0)  # a matrix whose near plane does not imply w > 0: take the whole line
+    safe = torch.where(valid & (w > 0), w, 1.0)
+    position = torch.stack([(points[:, 0] / safe + 1) * (width / 2), (1 - points[:, 1] / safe) * (height / 2)], dim=1)
+    mask = valid.unsqueeze(1)
+    low = torch.where(mask, position, torch.inf).amin(0)
+    high = torch.where(mask, position, -torch.inf).amax(0)
+    return torch.where(unsafe, -torch.inf, low), torch.where(unsafe, torch.inf, high)

@@ -1,0 +1,45 @@
+"""Stable lexicographic sorts of values that belong to owners.
+
+Before: packed.py.  After: intervals.py (by pixel), cells.py (by time, by depth).
+Source: ours; `torch.sort` is stable only when asked.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def argsort_by(*keys: Tensor) -> Tensor:
+    """Return the stable order by the first key, then the second, and so on (N,) int64; all ascending. Source: ours."""
+    order = None
+    for key in reversed(keys):
+        if order is None:
+            order = torch.sort(key, stable=True).indices
+        else:
+            order = order[torch.sort(key[order], stable=True).indices]
+    return order
+
+
+def inverse(order: Tensor) -> Tensor:
+    """Return where each value went, so that `inverse(order)[order]` counts up. Source: ours."""
+    place = torch.zeros_like(order)
+    place[order] = torch.arange(len(order), device=order.device)
+    return place
+
+
+def reorder_ties(order: Tensor, tied_to_previous: Tensor, rank: Tensor) -> Tensor:
+    """Return `order` with each run of tied neighbours put in ascending order of `rank`.
+
+    Args:
+        order: (N,) int64 values in their present order.
+        tied_to_previous: (N,) bool by place: tied to the value before it.
+        rank: (N,) int64 by value.
+
+    Returns:
+        (N,) int64. Source: ours.
+    """
+    if not tied_to_previous.any():
+        return order
+    group = torch.cumsum((~tied_to_previous).long(), dim=0)
+    return order[argsort_by(group, rank[order])]

@@ -1,0 +1,144 @@
+"""Command line: `python -m datagen --out DIR --count N …` (the only door to tyro).
+
+Before: spec.py, runs.py.  After: nothing.
+Exit codes: 0 all done; 1 frames failed or assets were refused, which are listed; 2 wrong usage or configuration;
+130 interrupted. Starting the same command again finishes what is missing.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any, Literal
+
+import tyro
+
+from datagen.spec import SpecError, parse_spec, read_spec_fields
+
+EXIT_DONE, EXIT_FAILURES, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+NOT_IN_THE_SPEC = ("out", "workers", "config")
+
+
+@dataclass(frozen=True)
+class Arguments:
+    """Generate sharp and exactly motion-blurred images with motion, depth, masks and ids.
+
+    Stopped or killed, the same command finishes the rest; the bytes depend neither on that nor on the workers.
+    """
+
+    out: str
+    """Folder of the data set; created if need be."""
+    config: str | None = None
+    """TOML file with any of the options below but --workers; options given here win."""
+    count: int = 16
+    """Number of frames."""
+    width: int = 256
+    """Width of the images [px]."""
+    height: int = 256
+    """Height of the images [px]."""
+    seed: int = 0
+    """Everything random follows from it."""
+    source: Literal["primitives", "meshes", "sequence"] = "primitives"
+    """Built-in shapes, a folder of mesh files, or one mesh played through time."""
+    assets: str | None = None
+    """Folder of mesh files (meshes); .npz, mesh file or folder of frames (sequence)."""
+    frames_per_clip: int = 1
+    """Consecutive frames that share scene, motion and camera path."""
+    fps: float = 24.0
+    """Frames per second of a clip."""
+    exposure: float = 0.5
+    """Share of the frame time during which the shutter is open, above 0 to 1."""
+    rays_per_pixel: int = 4
+    """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
+    sequence_fps: float = 24.0
+    """Frames per second at which a sequence is played."""
+    workers: int = 1
+    """Processes that make frames; 0 and 1 work in this one."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return the exit code.
+
+    Args:
+        argv: arguments without the program's name; those of the process if not given.
+
+    Source: ours.
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        arguments = tyro.cli(
+            tyro.conf.configure(tyro.conf.FlagConversionOff)(Arguments),
+            prog="python -m datagen",
+            args=words,
+            default=_defaults(words),
+        )
+        chosen = {f.name: getattr(arguments, f.name) for f in fields(arguments) if f.name not in NOT_IN_THE_SPEC}
+        spec = parse_spec(chosen)
+    except SpecError as error:
+        return _usage(error.problems)
+    except SystemExit as stop:  # tyro has printed the help or what is wrong
+        return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
+    return _run(spec, arguments)
+
+
+def _run(spec: Any, arguments: Arguments) -> int:
+    """Generate and tell how it went."""
+    from datagen.assets import MeshError
+    from datagen.manifest import ManifestError
+    from datagen.runs import generate
+
+    try:
+        result = generate(spec, arguments.out, arguments.workers, is_quiet=False)
+    except (SpecError, MeshError, ManifestError) as error:
+        return _usage(str(error).splitlines())
+    except KeyboardInterrupt:
+        print("interrupted; the same command finishes the rest", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    print(f"{result.made} frames made, {result.kept} kept, {len(result.failed)} failed in {result.folder}")
+    if result.contact_sheet is not None:
+        print(f"contact sheet: {result.contact_sheet}")
+    for index, reason in result.failed:
+        print(f"failed frame {index}: {reason}", file=sys.stderr)
+    for name, reason in result.refused:
+        print(f"refused {name}: {reason}", file=sys.stderr)
+    return EXIT_DONE if result.is_complete else EXIT_FAILURES
+
+
+def _defaults(words: Sequence[str]) -> Any:
+    """Return the arguments' defaults: those of the file named by --config, if any, over the built-in ones."""
+    path = None
+    for k, word in enumerate(words):
+        if word == "--config" and k + 1 < len(words):
+            path = words[k + 1]
+        elif word.startswith("--config="):
+            path = word.removeprefix("--config=")
+    base = Arguments(out=tyro.MISSING)
+    if path is None:
+        return base
+    given = read_spec_fields(path)
+    parse_spec(given | _paths_given(words))  # its own faults are told before those of the command line
+    return replace(base, **given)
+
+
+def _paths_given(words: Sequence[str]) -> dict[str, Any]:
+    """Return source and assets as the command line has them, as they must fit each other."""
+    found = {}
+    for name in ("source", "assets"):
+        for k, word in enumerate(words):
+            if word == f"--{name}" and k + 1 < len(words):
+                found[name] = words[k + 1]
+            elif word.startswith(f"--{name}="):
+                found[name] = word.split("=", 1)[1]
+    return found
+
+
+def _usage(problems: Sequence[str]) -> int:
+    """Print what is wrong, a line each, and return the exit code."""
+    for problem in problems:
+        print(f"error: {problem}", file=sys.stderr)
+    return EXIT_USAGE
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,352 @@
+"""Assets: people's mesh files and sequences, read with distrust (the only door to trimesh).
+
+Before: colour.py.  After: scenes.py.
+Symbols: V vertices, F faces, P frames of a sequence. Nothing is merged, renumbered or repaired: order is kept.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+import os
+import re
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from datagen.colour import linear_from_srgb
+
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+# Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
+UNREAD_SUFFIXES = (
+    ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usd", ".usda", ".usdc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
+    ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
+)  # fmt: skip
+MAX_FILE_BYTES = 256 * 2**20  # parsing takes several times as much memory
+MAX_FACES = 50_000_000
+MAX_VERTICES = 25_000_000
+MAX_COORDINATE = 1e6  # beyond it float32 positions are coarser than a thousandth
+READABLE_EXTENSIONS = re.compile(r"KHR_(materials_\w+|texture_transform|lights_punctual)")
+DEFAULT_GREYS = ((102, 102, 102), (128, 128, 128))  # trimesh's own colour where a file has none
+
+
+class MeshError(ValueError):
+    """A file that cannot be used, and why."""
+
+    def __init__(self, path: str | Path, reason: str) -> None:
+        super().__init__(f"{path}: {reason}")
+        self.path, self.reason = str(path), reason
+
+
+@dataclass(frozen=True, eq=False)
+class MeshAsset:
+    """A mesh as its file has it, moved to the origin and scaled to a bounding radius of 1."""
+
+    name: str
+    vertices: Tensor  # (V, 3) float64
+    faces: Tensor  # (F, 3) int64
+    color: Tensor | None  # (F, 3) float64 linear, or none in the file
+    opacity: Tensor | None  # (F,) float64, or none in the file
+    notes: tuple[str, ...]  # what in the file is not used
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceAsset:
+    """Frames of one mesh, moved to the origin and scaled so that all of them fit a radius of 1."""
+
+    name: str
+    positions: Tensor  # (P, V, 3) float64
+    faces: Tensor  # (F, 3) int64
+    color: Tensor | None  # (F, 3) float64 linear, or none
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Roster:
+    """The usable files of a folder, and the others with the reason."""
+
+    names: tuple[str, ...]  # relative paths, sorted
+    refused: tuple[tuple[str, str], ...]  # (relative path, reason)
+    sha256: str  # of the names and contents of the usable ones
+
+
+def survey_meshes(folder: str | Path) -> Roster:
+    """Read every mesh file under `folder` once and return which can be used.
+
+    Raises:
+        MeshError: none can, or there is none.
+
+    Source: ours.
+    """
+    names, refused, digest = [], [], hashlib.sha256()
+    for name in _files_under(folder):
+        suffix = Path(name).suffix.lower()
+        if suffix in UNREAD_SUFFIXES:
+            refused.append((name, f"expected one of {', '.join(MESH_SUFFIXES)}, got a {suffix} file"))
+        if suffix not in MESH_SUFFIXES:
+            continue
+        path = Path(folder) / name
+        try:
+            load_mesh(str(path))
+        except MeshError as error:
+            refused.append((name, error.reason))
+            continue
+        names.append(name)
+        digest.update(json.dumps([name, _file_sha256(path)]).encode())
+    if not names:
+        found = "; ".join(f"{n}: {r}" for n, r in refused) or "no mesh file at all"
+        raise MeshError(folder, f"expected at least one usable mesh file, got {found}")
+    return Roster(tuple(names), tuple(refused), digest.hexdigest())
+
+
+def survey_sequence(path: str | Path) -> Roster:
+    """Read a sequence once and return its hash.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    load_sequence(str(path))
+    path, digest = Path(path), hashlib.sha256()
+    files = [path] if path.is_file() else [path / name for name in _frame_names(path)]
+    for file in files:
+        digest.update(json.dumps([file.name, _file_sha256(file)]).encode())
+    return Roster((path.name,), (), digest.hexdigest())
+
+
+@functools.lru_cache(maxsize=16)  # clips of a worker draw from the same few files
+def load_mesh(path: str) -> MeshAsset:
+    """Return a mesh file, checked and normalised.
+
+    Raises:
+        MeshError: not readable, no triangles, NaN, out-of-range indices or values, too large, no extent.
+
+    Source: ours.
+    """
+    vertices, faces, color, opacity, notes = _parse(Path(path))
+    vertices = _normalise(path, vertices[None])[0]
+    return MeshAsset(Path(path).name, vertices, faces, color, opacity, notes)
+
+
+@functools.lru_cache(maxsize=2)
+def load_sequence(path: str) -> SequenceAsset:
+    """Return a sequence: a `.npz` with `vertices` (P, V, 3) and `faces` (F, 3), a folder of mesh files with equal
+    faces (one per frame, in the order of the numbers in their names), or one mesh file, which stands still.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    place = Path(path)
+    if place.is_dir():
+        return _load_frames(place)
+    if place.suffix.lower() != ".npz":
+        vertices, faces, color, _, notes = _parse(place)
+        note = "one mesh file: a single frame, so the mesh itself stands still"
+        return SequenceAsset(place.name, _normalise(path, vertices[None]), faces, color, (*notes, note))
+    _check_size(place)
+    try:
+        with np.load(place, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in ("vertices", "faces") if name in archive.files}
+    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, SyntaxError) as error:
+        raise MeshError(path, f"expected a readable .npz file without pickles, got {_reason(error)}") from None
+    except Exception as error:  # zipfile and zlib raise their own kinds on broken archives
+        raise MeshError(path, f"expected a readable .npz file, got {_reason(error)}") from None
+    for name in ("vertices", "faces"):
+        if name not in arrays:
+            raise MeshError(path, f"{name}: expected an array of that name, got none")
+    positions, faces = arrays["vertices"], arrays["faces"]
+    if positions.ndim != 3 or positions.shape[-1] != 3 or positions.dtype.kind != "f":
+        raise MeshError(path, f"vertices: expected (frames, V, 3) float, got {positions.shape} {positions.dtype}")
+    if len(positions) < 1:
+        raise MeshError(path, "vertices: expected at least one frame, got none")
+    checked = _check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
+    return SequenceAsset(place.name, _normalise(path, checked[0].reshape(positions.shape)), checked[1], None, ())
+
+
+def _load_frames(folder: Path) -> SequenceAsset:
+    """Return the mesh files of a folder as the frames of one mesh."""
+    names = _frame_names(folder)
+    if not names:
+        raise MeshError(folder, f"expected frames as {', '.join(MESH_SUFFIXES)} files, got none")
+    frames, first = [], None
+    for name in names:
+        vertices, faces, color, _, notes = _parse(folder / name)
+        first = first or (faces, color, notes)
+        if not torch.equal(faces, first[0]) or (frames and vertices.shape != frames[0].shape):
+            raise MeshError(folder / name, f"expected the vertices and faces of {names[0]}, got others")
+        frames.append(vertices)
+    return SequenceAsset(folder.name, _normalise(folder, torch.stack(frames)), first[0], first[1], first[2])
+
+
+def _frame_names(folder: Path) -> list[str]:
+    """Return the mesh files directly in a folder, ordered by the numbers in their names."""
+    names = [p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES and p.is_file()]
+    return sorted(names, key=lambda n: ([int(d) for d in re.findall(r"\d+", n)], n))
+
+
+def _files_under(folder: str | Path) -> list[str]:
+    """Return the relative paths of all files under a folder, sorted; links to folders are not followed."""
+    found = []
+    for root, _, files in os.walk(folder, followlinks=False):
+        found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]
+    return sorted(found)
+
+
+def _parse(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tuple[str, ...]]:
+    """Return vertices, faces, colour, opacity and notes of a mesh file, checked, as the file has them."""
+    suffix = path.suffix.lower()
+    if suffix not in MESH_SUFFIXES:
+        raise MeshError(path, f"expected one of {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}")
+    _check_size(path)
+    notes = _gltf_notes(path) if suffix in (".glb", ".gltf") else ()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the gate below decides, not the parser
+            scene = trimesh.load_scene(path, process=False, allow_remote=False)
+            parts = [_part(scene, node) for node in sorted(scene.graph.nodes_geometry, key=str)]
+    except MeshError:
+        raise
+    except ModuleNotFoundError as error:
+        why = (
+            "text that is not UTF-8" if error.name in ("charset_normalizer", "chardet") else f"a need for {error.name}"
+        )
+        raise MeshError(path, f"expected a file readable without further packages, got {why}") from None
+    except Exception as error:  # the parsers raise ValueError, IndexError, KeyError, UnboundLocalError and more
+        raise MeshError(path, f"expected a readable {suffix} file, got {_reason(error)}") from None
+    parts = [p for p in parts if p is not None]
+    if sum(len(p[1]) for p in parts) > MAX_FACES or sum(len(p[0]) for p in parts) > MAX_VERTICES:
+        raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
+    if not parts:
+        raise MeshError(path, "expected triangles, got none")
+    checked = [_check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
+    starts = np.cumsum([0, *[len(v) for v, _ in checked]])
+    faces = torch.cat([f + int(start) for (_, f), start in zip(checked, starts, strict=False)])
+    rgba = None
+    if any(p[2] is not None for p in parts):
+        filled = [np.full((len(p[1]), 4), 0.7) if p[2] is None else p[2] for p in parts]
+        rgba = torch.from_numpy(np.concatenate(filled))
+    color = None if rgba is None else linear_from_srgb(rgba[:, :3].contiguous())
+    opacity = rgba[:, 3].contiguous() if rgba is not None and bool((rgba[:, 3] < 1).any()) else None
+    return torch.cat([v for v, _ in checked]), faces, color, opacity, notes
+
+
+def _part(scene: Any, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:
+    """Return world vertices, faces and (F, 4) sRGB colours in [0, 1] of one node, or None if it has no triangles."""
+    transform, name = scene.graph[node]
+    geometry = scene.geometry[name]
+    faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3), np.int64)))
+    vertices = np.asarray(geometry.vertices, dtype=np.float64)
+    if len(faces) == 0:
+        return None
+    if np.max(faces, initial=0) >= len(vertices) or np.min(faces, initial=0) < 0:
+        return vertices, faces, None  # refused by the gate; its colours cannot be looked up
+    placed = vertices @ transform[:3, :3].T + transform[:3, 3]
+    return placed, faces, _part_rgba(geometry, faces)
+
+
+def _part_rgba(geometry: Any, faces: np.ndarray) -> np.ndarray | None:
+    """Return (F, 4) sRGB colours in [0, 1]: of faces, of vertices (their mean), of a texture at the face's centre."""
+    visual = geometry.visual
+    if visual.kind in ("face", "vertex"):
+        colours = np.asarray(visual.face_colors)
+    elif visual.kind == "texture":
+        uv, material = visual.uv, visual.material
+        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        if uv is not None and len(uv) == len(geometry.vertices) and image is not None and np.isfinite(uv).all():
+            colours = np.asarray(material.to_color(np.asarray(uv)[faces].mean(1)))
+        else:
+            main = np.asarray(material.main_color)
+            if tuple(int(c) for c in main[:3]) in DEFAULT_GREYS:
+                return None
+            colours = np.broadcast_to(main, (len(faces), len(main)))
+        if getattr(material, "alphaMode", None) != "BLEND":
+            colours = np.concatenate([colours[:, :3], np.full((len(faces), 1), 255, colours.dtype)], 1)
+    else:
+        return None
+    if colours.shape != (len(faces), 4) or colours.dtype != np.uint8:
+        return None
+    return colours.astype(np.float64) / 255
+
+
+def _gltf_notes(path: Path) -> tuple[str, ...]:
+    """Refuse glTF files whose meshes need an extension that is not read; return notes on animations."""
+    try:
+        blob = path.read_bytes()
+        if path.suffix.lower() == ".glb" and len(blob) >= 20:
+            blob = blob[20 : 20 + int.from_bytes(blob[12:16], "little")]
+        tree = json.loads(blob.decode("utf-8-sig"))
+    except (OSError, ValueError, RecursionError) as error:
+        raise MeshError(path, f"expected glTF with JSON inside, got {_reason(error)}") from None
+    if not isinstance(tree, dict):
+        raise MeshError(path, f"expected a glTF object, got a JSON {type(tree).__name__}")
+    # Without its decoder the parser fills a compressed mesh with zeros and says nothing.
+    needed = [e for e in tree.get("extensionsRequired") or [] if not READABLE_EXTENSIONS.fullmatch(str(e))]
+    needed += [
+        e for e in ("KHR_draco_mesh_compression", "EXT_meshopt_compression") if e in (tree.get("extensionsUsed") or [])
+    ]
+    if needed:
+        raise MeshError(path, f"expected no required extension, got {', '.join(sorted(set(map(str, needed))))}")
+    still = [k for k in ("animations", "skins") if tree.get(k)]
+    return (f"{' and '.join(still)} in the file are not read: the mesh keeps its rest pose",) if still else ()
+
+
+def _check_size(path: Path) -> None:
+    """Raise for files that are missing, empty or too large to be parsed safely."""
+    try:
+        size = path.stat().st_size
+    except OSError as error:
+        raise MeshError(path, f"expected a file, got {_reason(error)}") from None
+    if not path.is_file():
+        raise MeshError(path, "expected a file, got something else")
+    if not 0 < size <= MAX_FILE_BYTES:
+        raise MeshError(path, f"expected 1 to {MAX_FILE_BYTES} bytes, got {size}")
+
+
+def _check_geometry(
+    path: str | Path, vertices: np.ndarray, faces: np.ndarray, n_vertices: int
+) -> tuple[Tensor, Tensor]:
+    """Return vertices (N, 3) float64 and faces (F, 3) int64, or raise: the gate that every mesh passes."""
+    if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
+        raise MeshError(path, f"faces: expected (F, 3) integers, got {faces.shape} {faces.dtype}")
+    if len(faces) == 0:
+        raise MeshError(path, "faces: expected at least one triangle, got none")
+    outside = (faces < 0) | (faces >= n_vertices)
+    if outside.any():
+        raise MeshError(path, f"faces: expected indices in [0, {n_vertices}), got {int(faces[outside][0])}")
+    vertices = np.asarray(vertices, dtype=np.float64)
+    if not np.isfinite(vertices).all():
+        raise MeshError(path, f"vertices: expected finite values, got {vertices[~np.isfinite(vertices)][0]}")
+    if np.abs(vertices).max(initial=0) > MAX_COORDINATE:
+        raise MeshError(path, f"vertices: expected at most {MAX_COORDINATE:g}, got {np.abs(vertices).max():g}")
+    return torch.from_numpy(np.ascontiguousarray(vertices)), torch.from_numpy(faces.astype(np.int64))
+
+
+def _normalise(path: str | Path, positions: Tensor) -> Tensor:
+    """Return (P, V, 3) positions centred and scaled to a bounding radius of 1."""
+    points = positions.reshape(-1, 3)
+    centred = positions - (points.amin(0) + points.amax(0)) / 2
+    radius = float(centred.norm(dim=-1).max())
+    if not radius > 1e-12:
+        raise MeshError(path, f"vertices: expected some extent, got a radius of {radius:g}")
+    return centred / radius
+
+
+def _file_sha256(path: Path) -> str:
+    """Return the hash of a file's bytes."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _reason(error: BaseException) -> str:
+    """Return an exception as one short line."""
+    text = " ".join(str(error).split())[:200]
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__

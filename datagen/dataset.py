@@ -1,0 +1,120 @@
+"""Dataset: what was written, as tensors for training.
+
+Before: writer.py, manifest.py.  After: report.py and people's training code.
+Images leave as (C, H, W) float32. Symbols: H, W image size.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from datagen.manifest import read_manifest
+from datagen.writer import FrameFileError, frame_paths, read_exr
+
+# name -> (part, channels)
+PLANES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "sharp": ("sharp", ("R", "G", "B")),
+    "blurred": ("blurred", ("R", "G", "B")),
+    "motion": ("data", ("forward.u", "forward.v")),
+    "motion_next": ("data", ("next.u", "next.v")),
+    "motion_previous": ("data", ("previous.u", "previous.v")),
+    "depth": ("data", ("Z",)),
+    "alpha": ("data", ("A",)),
+    "sharp_alpha": ("sharp", ("A",)),
+}
+IDS = {"mesh_id": "id.mesh", "face_id": "id.face"}
+
+
+class BlurDataset(Dataset[dict[str, Any]]):
+    """The finished frames of a folder, in the order of their numbers.
+
+    An item is a dict of tensors: `sharp`, `blurred` (3, H, W) linear RGB; `motion` (2, H, W) [px, x right, y down]
+    over the exposure, `motion_next` and `motion_previous` to the neighbour frames' sharp instants (NaN where the
+    point is behind the camera then); `depth` (1, H, W) [scene units], inf where nothing is; `alpha` over the exposure
+    and `sharp_alpha` (1, H, W); `mesh_id` and `face_id` (1, H, W) int64, -1 where nothing is; `index`; and `meta`, the
+    frame's metadata as JSON text, which the default collate of a DataLoader keeps as a list of str.
+
+    Files are opened when an item is asked for; the object is small and can travel to worker processes.
+
+    Args:
+        folder: of the data set.
+        keys: which of the tensors to read; all if not given.
+
+    Raises:
+        FileNotFoundError: no manifest there.
+        ValueError: a key that does not exist, or a folder without any finished frame.
+
+    Example:
+        >>> BlurDataset("out")[0]["blurred"].shape  # doctest: +SKIP
+        torch.Size([3, 256, 256])
+    """
+
+    def __init__(self, folder: str | Path, keys: Sequence[str] | None = None) -> None:
+        known = (*PLANES, *IDS)
+        unknown = [k for k in keys or () if k not in known]
+        if unknown:
+            raise ValueError(f"keys: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+        self.folder = Path(folder)
+        self.keys = tuple(known if keys is None else keys)
+        try:
+            self.indices = tuple(read_manifest(folder))
+        except FileNotFoundError:
+            raise FileNotFoundError(f"folder: expected a data set with a manifest.jsonl, got {str(folder)!r}") from None
+        if not self.indices:
+            raise ValueError(f"folder: expected at least one finished frame, got none in {str(folder)!r}")
+
+    def __len__(self) -> int:
+        """Return the number of finished frames."""
+        return len(self.indices)
+
+    def __getitem__(self, item: int) -> dict[str, Any]:
+        """Return one frame as a dict of tensors and its metadata.
+
+        Raises:
+            IndexError: no such item.
+            FrameFileError: the file is missing or damaged; it is named.
+        """
+        index = self.indices[item]
+        path = self.folder / frame_paths(index)["exr"]
+        parts, meta = read_exr(path)
+        result: dict[str, Any] = {"index": index, "meta": json.dumps(meta, sort_keys=True)}
+        try:
+            for key in self.keys:
+                if key in IDS:
+                    result[key] = torch.from_numpy(parts["data"][IDS[key]].astype(np.int64)).unsqueeze(0) - 1
+                else:
+                    result[key] = _stack(parts, *PLANES[key])
+        except KeyError as error:
+            raise FrameFileError(f"{path}: expected a channel {error}, got a frame without it") from None
+        return result
+
+    def coverage(self, item: int) -> Tensor:
+        """Return (M, H, W) float32, the share of the exposure in which mesh m is visible; M differs between clips.
+
+        Raises:
+            FrameFileError: the file is missing or damaged.
+
+        Source: ours.
+        """
+        parts, _ = read_exr(self.folder / frame_paths(self.indices[item])["exr"])
+        planes = parts.get("coverage", {})
+        if not planes:
+            return torch.zeros(0, *parts["data"]["A"].shape)
+        return torch.from_numpy(np.stack([planes[name] for name in sorted(planes)]))
+
+    def metadata(self, item: int) -> dict[str, Any]:
+        """Return the metadata of a frame as a dict. Source: ours."""
+        return read_exr(self.folder / frame_paths(self.indices[item])["exr"])[1]
+
+
+def _stack(parts: dict[str, dict[str, np.ndarray]], part: str, channels: tuple[str, ...]) -> Tensor:
+    """Return channels as (C, H, W) float32."""
+    return torch.from_numpy(np.stack([parts[part][c].astype(np.float32) for c in channels]))

@@ -1,0 +1,162 @@
+"""Scenes: from the specification and a clip's number to the clip.
+
+Before: spec.py, assets.py, stages.py, casts.py.  After: samples.py.
+Clip number c depends on (seed, c) and the assets, never on other clips.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import dataclass
+from pathlib import Path as FilePath
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datagen.assets import Roster, load_mesh, load_sequence, survey_meshes, survey_sequence
+from datagen.casts import build_cast, choose_motion, choose_places
+from datagen.clips import Actor, Clip
+from datagen.motions import PlayedVertices, RigidBody, turns
+from datagen.patterns import light, paint, palette_colours
+from datagen.seeds import open_stream
+from datagen.shapes import Shape
+from datagen.spec import DatasetSpec, parse_spec
+from datagen.stages import choose_stage
+
+NO_ASSETS = Roster((), (), "")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A specification together with the assets that it may use: all that a worker needs."""
+
+    spec: DatasetSpec
+    asset_names: tuple[str, ...]  # relative to spec.assets
+    assets_sha256: str
+
+    @property
+    def config_sha256(self) -> str:
+        """Hash of everything that the bytes of a frame depend on, but its index."""
+        return self.spec.config_sha256(self.assets_sha256)
+
+    def to_json(self) -> str:
+        """Return the plan as text that `plan_from_json` reads back equal."""
+        fields = {"spec": self.spec.model_dump(), "asset_names": self.asset_names, "assets_sha256": self.assets_sha256}
+        return json.dumps(fields, sort_keys=True)
+
+
+def plan_from_json(text: str) -> Plan:
+    """Return the plan that `Plan.to_json` wrote. Source: ours."""
+    fields = json.loads(text)
+    return Plan(parse_spec(fields["spec"]), tuple(fields["asset_names"]), fields["assets_sha256"])
+
+
+def survey_assets(spec: DatasetSpec) -> Roster:
+    """Read all assets once.
+
+    Raises:
+        MeshError: none of them can be used.
+
+    Source: ours.
+    """
+    if spec.source == "primitives":
+        return NO_ASSETS
+    return survey_meshes(str(spec.assets)) if spec.source == "meshes" else survey_sequence(str(spec.assets))
+
+
+def build_clip(plan: Plan, clip: int) -> Clip:
+    """Return clip number `clip`.
+
+    Args:
+        plan: specification and assets.
+        clip: at least 0.
+
+    Raises:
+        MeshError: an asset cannot be read any more.
+
+    Source: ours.
+    """
+    spec = plan.spec
+    rngs = {
+        name: open_stream(spec.seed, name, clip) for name in ("stage", "camera", "cast", "motion", "colour", "backdrop")
+    }
+    number = int(rngs["stage"].integers(0, 2**31))
+    colours = palette_colours(number)
+    stage = choose_stage((rngs["camera"], rngs["backdrop"]), colours, (spec.width, spec.height))
+    aspect = spec.width / spec.height
+    notes: dict[str, object] = {"source": spec.source, **stage.kinds}
+    if spec.source == "primitives":
+        cast = build_cast((rngs["cast"], rngs["motion"], rngs["colour"]), colours, aspect)
+    elif spec.source == "meshes":
+        cast = _mesh_cast(plan, rngs, colours, notes)
+    else:
+        cast = [_sequence_actor(plan, rngs, colours, notes)]
+    return Clip((*stage.actors, *cast), stage.camera, stage.background, notes)
+
+
+def _mesh_cast(
+    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object]
+) -> list[Actor]:
+    """Return one to three of people's meshes, each with a rigid motion."""
+    rng, spec = rngs["cast"], plan.spec
+    n = int(rng.choice((1, 2, 3), p=(0.4, 0.35, 0.25)))
+    aspect = spec.width / spec.height
+    places = choose_places(rng, n, aspect)
+    actors, not_used = [], []
+    for k in range(n):
+        name = plan.asset_names[int(rng.integers(0, len(plan.asset_names)))]
+        asset = load_mesh(str(FilePath(str(spec.assets)) / name))
+        size = float(rng.uniform(1.25, 1.75)) * (1.0, 0.8, 0.66)[n - 1] * min(1.0, max(aspect, 0.5))
+        shape = Shape(asset.vertices * size, asset.faces, _flat_uv(asset.vertices, asset.faces), False)
+        place = tuple(0.35 * c for c in places[0]) if n == 1 else tuple(0.8 * c for c in places[k])
+        body = RigidBody(shape.vertices, choose_motion(rngs["motion"], place, size))
+        color = _asset_color(shape, asset.color, colours, rngs["colour"])
+        opacity: Tensor | float = 1.0 if asset.opacity is None else asset.opacity.to(torch.float32)
+        actors.append(Actor(f"{name}-{k}", shape.faces, color, body, opacity))
+        not_used += [f"{name}: {note}" for note in asset.notes]
+    notes["assets"] = sorted({a.name.rsplit("-", 1)[0] for a in actors})
+    if not_used:
+        notes["not_used"] = sorted(set(not_used))
+    return actors
+
+
+def _sequence_actor(
+    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object]
+) -> Actor:
+    """Return the sequence as one body: turned about the vertical and started somewhere, by the clip."""
+    rng, spec = rngs["cast"], plan.spec
+    asset = load_sequence(str(spec.assets))
+    angle = torch.tensor([float(rng.uniform(-math.pi, math.pi))], dtype=torch.float64)
+    size = 1.75 * min(1.0, max(spec.width / spec.height, 0.5))
+    positions = asset.positions @ turns((0.0, 1.0, 0.0), angle)[0].T * size
+    length_s = max(len(positions) - 1, 0) / spec.sequence_fps
+    start_s = float(rng.uniform(0, 2 * length_s))
+    shape = Shape(positions[0], asset.faces, _flat_uv(positions[0], asset.faces), False)
+    color = _asset_color(shape, asset.color, colours, rngs["colour"])
+    notes["sequence"] = {
+        "file": asset.name,
+        "frames": len(positions),
+        "rate_hz": spec.sequence_fps,
+        "start_s": start_s,
+        "played": "back and forth, linear between its frames",
+    }
+    if asset.notes:
+        notes["not_used"] = list(asset.notes)
+    return Actor(asset.name, asset.faces, color, PlayedVertices(positions, spec.sequence_fps, start_s))
+
+
+def _asset_color(shape: Shape, given: Tensor | None, colours: Tensor, rng: np.random.Generator) -> Tensor:
+    """Return face colours in painted light: the file's own, or two of the palette where it has none."""
+    own = colours[torch.from_numpy(rng.permutation(len(colours) - 1) + 1)]
+    pattern = str(rng.choice(("plain", "gradient", "noise"), p=(0.4, 0.35, 0.25)))
+    painted = paint(shape, own, pattern, rng)
+    return light(shape, painted if given is None else given, two_sided=True).to(torch.float32)
+
+
+def _flat_uv(vertices: Tensor, faces: Tensor) -> Tensor:
+    """Return (F, 2) places of the faces seen from the front, in [0, 1]."""
+    low, high = vertices.amin(0), vertices.amax(0)
+    centres = vertices[faces].mean(1)
+    return ((centres - low) / (high - low).clamp(min=1e-12))[:, :2]

@@ -210,17 +210,18 @@ def _covered_pieces(prisms: Prisms, prism: Tensor, corners: Corners) -> tuple[Te
 
     one_sided = prisms.surfaces.is_one_sided[prisms.face_of[prism]]
     hidden_sign = torch.where(one_sided, -prisms.parity[prism], 0).to(torch.int8)
-    signs = []
-    for k in range(u.shape[1] - 1):
-        middle = 0.5 * (u[:, k] + u[:, k + 1])
-        x, y, w_middle = corners.at(middle)
-        sign = edges.inside_sign(x, y, w_middle)
-        if is_clipped:
-            e = edges.edges_of(x, y) * sign
-            for plane in planes:
-                sign = sign * ((e * ((1 - middle) * plane[0] + middle * plane[1])).sum(0) >= 0)
-        signs.append(sign * ((u[:, k] < u[:, k + 1]) & (sign != hidden_sign)))
-    sign = torch.stack(signs, dim=1)  # (m, pieces)
+    sign = torch.zeros(len(u), u.shape[1] - 1, dtype=torch.int8, device=u.device)
+    for k in range(sign.shape[1]):
+        real = (u[:, k] < u[:, k + 1]).nonzero().flatten()  # most pairs have few roots: later pieces are rare
+        few = len(real) < len(u) // 2
+        part, clip_planes = (corners[real], [p[..., real] for p in planes]) if few else (corners, planes)
+        start, end = (u[real, k], u[real, k + 1]) if few else (u[:, k], u[:, k + 1])
+        side = edges.inside_sign(part, clip_planes, start, end)
+        if few:
+            sign[real, k] = side
+        else:
+            sign[:, k] = side * (start < end)
+    sign = torch.where(sign == hidden_sign.unsqueeze(1), 0, sign)
     nothing = torch.zeros_like(sign[:, :1])
     begins = (sign != 0) & (sign != torch.cat([nothing, sign[:, :-1]], dim=1))
     finishes = (sign != 0) & (sign != torch.cat([sign[:, 1:], nothing], dim=1))

@@ -29,6 +29,8 @@ BYTES_PER_PAIR = 700  # peak of find_intervals, measured by scripts/benchmark_me
 BYTES_PER_LAYER = 260  # peak of cut_cells and resolve_cells
 MIN_MEMORY_BYTES = 1 << 20
 MAX_RAYS = 4096
+COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "deepest_pixel")
+STAGES = ("prisms", "intervals", "cells", "resolve")
 
 
 @dataclass(frozen=True)
@@ -37,22 +39,22 @@ class Frame:
 
     rgba: Tensor  # (H, W, 4) linear: RGB is what the pixel sees, background included; A the meshes' mean opacity
     coverage: Tensor  # (H, W, M) share of the shutter's window in which each mesh is visible at the pixel
-    counts: dict[str, int]  # prisms, blocks, pairs, intervals, cells, layers, crossings, deepest_pixel
-    timings: dict[str, float]  # seconds per stage
+    counts: dict[str, int]  # how many of COUNTS
+    timings: dict[str, float]  # seconds in each of STAGES
 
 
 @dataclass
 class _Ledger:
     """What was done so far."""
 
-    counts: dict[str, int] = field(default_factory=dict)
-    timings: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTS, 0))
+    timings: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
 
     def add(self, name: str, n: int) -> None:
-        self.counts[name] = self.counts.get(name, 0) + int(n)
+        self.counts[name] += int(n)
 
     def deepest(self, name: str, n: int) -> None:
-        self.counts[name] = max(self.counts.get(name, 0), int(n))
+        self.counts[name] = max(self.counts[name], int(n))
 
     @contextmanager
     def stage(self, name: str, device: torch.device) -> Iterator[None]:
@@ -60,7 +62,7 @@ class _Ledger:
         yield
         if device.type == "cuda":
             torch.cuda.synchronize(device)
-        self.timings[name] = self.timings.get(name, 0.0) + time.perf_counter() - start
+        self.timings[name] += time.perf_counter() - start
 
 
 def render(
@@ -119,7 +121,9 @@ def render(
         total = sum(job.image(ray) for ray in pixel_rays(rays_per_pixel)) / rays_per_pixel
         alpha, coverage = total[..., 3:4], total[..., 4:]
         rgb = total[..., :3] + (1 - alpha) * scene.background.to(total)
-    rgba = torch.cat([rgb, alpha], dim=-1).to(scene.dtype)
+        rgba = torch.cat([rgb, alpha], dim=-1).to(scene.dtype)
+        for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
+            rgba = rgba + 0.0 * leaf.sum().to(rgba) if leaf.requires_grad else rgba
     return Frame(rgba, coverage.to(scene.dtype), ledger.counts, ledger.timings)
 
 

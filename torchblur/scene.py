@@ -167,13 +167,17 @@ class Scene:
             dtype = torch.promote_types(dtype, mesh.vertices.dtype)
         return dtype
 
+    def tensors(self) -> list[Tensor]:
+        """Return all floating tensors of the scene."""
+        parts = [self.camera.world_to_clip, self.background]
+        for mesh in self.meshes:
+            parts += [mesh.vertices, mesh.material.color, mesh.material.opacity]
+        return parts
+
     @property
     def requires_grad(self) -> bool:
         """Whether anything in the scene asks for gradients."""
-        tensors = [self.camera.world_to_clip, self.background]
-        for mesh in self.meshes:
-            tensors += [mesh.vertices, mesh.material.color, mesh.material.opacity]
-        return torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
+        return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors())
 
 
 def _same_device_if_large(name: str, value: Tensor, device: torch.device) -> None:

@@ -57,7 +57,8 @@ def _tie_ranks(meshes: tuple[Mesh, ...], device: torch.device) -> Tensor:
     mesh_keys, face_keys = [], []
     for mesh in meshes:
         with torch.no_grad():
-            knots = mesh.vertices.reshape(-1, *mesh.vertices.shape[-2:]).to(torch.float64)
+            knots = mesh.vertices.to(torch.float64)
+            knots = knots if knots.ndim == 3 else knots.unsqueeze(0)
             content = (knots[:, mesh.faces] + 0.0).contiguous().view(torch.int64)  # (knots, F, 3, 3); -0.0 becomes 0.0
             corner = torch.zeros(mesh.n_faces, 3, dtype=torch.int64, device=device)
             for numbers in content:

@@ -1,7 +1,7 @@
-"""Assets: people's mesh files and sequences, read with distrust (the only door to trimesh).
+"""Assets: people's mesh files, read with distrust (the only door to trimesh).
 
-Before: colour.py.  After: scenes.py.
-Symbols: V vertices, F faces, P frames of a sequence. Nothing is merged, renumbered or repaired: order is kept.
+Before: colour.py.  After: sequences.py, scenes.py.
+Symbols: V vertices, F faces. Nothing is merged, renumbered or repaired: order is kept.
 """
 
 from __future__ import annotations
@@ -57,17 +57,6 @@ class MeshAsset:
     notes: tuple[str, ...]  # what in the file is not used
 
 
-@dataclass(frozen=True, eq=False)
-class SequenceAsset:
-    """Frames of one mesh, moved to the origin and scaled so that all of them fit a radius of 1."""
-
-    name: str
-    positions: Tensor  # (P, V, 3) float64
-    faces: Tensor  # (F, 3) int64
-    color: Tensor | None  # (F, 3) float64 linear, or none
-    notes: tuple[str, ...]
-
-
 @dataclass(frozen=True)
 class Roster:
     """The usable files of a folder, and the others with the reason."""
@@ -94,32 +83,16 @@ def survey_meshes(folder: str | Path) -> Roster:
             continue
         path = Path(folder) / name
         try:
-            load_mesh(str(path))
+            asset = load_mesh(str(path))
         except MeshError as error:
             refused.append((name, error.reason))
             continue
         names.append(name)
-        digest.update(json.dumps([name, _file_sha256(path)]).encode())
+        digest.update(name.encode() + b"\0" + tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity))
     if not names:
         found = "; ".join(f"{n}: {r}" for n, r in refused) or "no mesh file at all"
         raise MeshError(folder, f"expected at least one usable mesh file, got {found}")
     return Roster(tuple(names), tuple(refused), digest.hexdigest())
-
-
-def survey_sequence(path: str | Path) -> Roster:
-    """Read a sequence once and return its hash.
-
-    Raises:
-        MeshError: it cannot be used.
-
-    Source: ours.
-    """
-    load_sequence(str(path))
-    path, digest = Path(path), hashlib.sha256()
-    files = [path] if path.is_file() else [path / name for name in _frame_names(path)]
-    for file in files:
-        digest.update(json.dumps([file.name, _file_sha256(file)]).encode())
-    return Roster((path.name,), (), digest.hexdigest())
 
 
 @functools.lru_cache(maxsize=16)  # clips of a worker draw from the same few files
@@ -131,67 +104,9 @@ def load_mesh(path: str) -> MeshAsset:
 
     Source: ours.
     """
-    vertices, faces, color, opacity, notes = _parse(Path(path))
-    vertices = _normalise(path, vertices[None])[0]
+    vertices, faces, color, opacity, notes = parse_mesh(Path(path))
+    vertices = normalise(path, vertices[None])[0]
     return MeshAsset(Path(path).name, vertices, faces, color, opacity, notes)
-
-
-@functools.lru_cache(maxsize=2)
-def load_sequence(path: str) -> SequenceAsset:
-    """Return a sequence: a `.npz` with `vertices` (P, V, 3) and `faces` (F, 3), a folder of mesh files with equal
-    faces (one per frame, in the order of the numbers in their names), or one mesh file, which stands still.
-
-    Raises:
-        MeshError: it cannot be used.
-
-    Source: ours.
-    """
-    place = Path(path)
-    if place.is_dir():
-        return _load_frames(place)
-    if place.suffix.lower() != ".npz":
-        vertices, faces, color, _, notes = _parse(place)
-        note = "one mesh file: a single frame, so the mesh itself stands still"
-        return SequenceAsset(place.name, _normalise(path, vertices[None]), faces, color, (*notes, note))
-    _check_size(place)
-    try:
-        with np.load(place, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in ("vertices", "faces") if name in archive.files}
-    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, SyntaxError) as error:
-        raise MeshError(path, f"expected a readable .npz file without pickles, got {_reason(error)}") from None
-    except Exception as error:  # zipfile and zlib raise their own kinds on broken archives
-        raise MeshError(path, f"expected a readable .npz file, got {_reason(error)}") from None
-    for name in ("vertices", "faces"):
-        if name not in arrays:
-            raise MeshError(path, f"{name}: expected an array of that name, got none")
-    positions, faces = arrays["vertices"], arrays["faces"]
-    if positions.ndim != 3 or positions.shape[-1] != 3 or positions.dtype.kind != "f":
-        raise MeshError(path, f"vertices: expected (frames, V, 3) float, got {positions.shape} {positions.dtype}")
-    if len(positions) < 1:
-        raise MeshError(path, "vertices: expected at least one frame, got none")
-    checked = _check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
-    return SequenceAsset(place.name, _normalise(path, checked[0].reshape(positions.shape)), checked[1], None, ())
-
-
-def _load_frames(folder: Path) -> SequenceAsset:
-    """Return the mesh files of a folder as the frames of one mesh."""
-    names = _frame_names(folder)
-    if not names:
-        raise MeshError(folder, f"expected frames as {', '.join(MESH_SUFFIXES)} files, got none")
-    frames, first = [], None
-    for name in names:
-        vertices, faces, color, _, notes = _parse(folder / name)
-        first = first or (faces, color, notes)
-        if not torch.equal(faces, first[0]) or (frames and vertices.shape != frames[0].shape):
-            raise MeshError(folder / name, f"expected the vertices and faces of {names[0]}, got others")
-        frames.append(vertices)
-    return SequenceAsset(folder.name, _normalise(folder, torch.stack(frames)), first[0], first[1], first[2])
-
-
-def _frame_names(folder: Path) -> list[str]:
-    """Return the mesh files directly in a folder, ordered by the numbers in their names."""
-    names = [p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES and p.is_file()]
-    return sorted(names, key=lambda n: ([int(d) for d in re.findall(r"\d+", n)], n))
 
 
 def _files_under(folder: str | Path) -> list[str]:
@@ -202,12 +117,18 @@ def _files_under(folder: str | Path) -> list[str]:
     return sorted(found)
 
 
-def _parse(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tuple[str, ...]]:
-    """Return vertices, faces, colour, opacity and notes of a mesh file, checked, as the file has them."""
+def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tuple[str, ...]]:
+    """Return vertices, faces, colour, opacity and notes of a mesh file, checked, as the file has them.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(path, f"expected one of {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}")
-    _check_size(path)
+    check_size(path)
     notes = _gltf_notes(path) if suffix in (".glb", ".gltf") else ()
     try:
         with warnings.catch_warnings():
@@ -222,13 +143,13 @@ def _parse(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tu
         )
         raise MeshError(path, f"expected a file readable without further packages, got {why}") from None
     except Exception as error:  # the parsers raise ValueError, IndexError, KeyError, UnboundLocalError and more
-        raise MeshError(path, f"expected a readable {suffix} file, got {_reason(error)}") from None
+        raise MeshError(path, f"expected a readable {suffix} file, got {short_reason(error)}") from None
     parts = [p for p in parts if p is not None]
     if sum(len(p[1]) for p in parts) > MAX_FACES or sum(len(p[0]) for p in parts) > MAX_VERTICES:
         raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
     if not parts:
         raise MeshError(path, "expected triangles, got none")
-    checked = [_check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
+    checked = [check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
     starts = np.cumsum([0, *[len(v) for v, _ in checked]])
     faces = torch.cat([f + int(start) for (_, f), start in zip(checked, starts, strict=False)])
     rgba = None
@@ -286,7 +207,7 @@ def _gltf_notes(path: Path) -> tuple[str, ...]:
             blob = blob[20 : 20 + int.from_bytes(blob[12:16], "little")]
         tree = json.loads(blob.decode("utf-8-sig"))
     except (OSError, ValueError, RecursionError) as error:
-        raise MeshError(path, f"expected glTF with JSON inside, got {_reason(error)}") from None
+        raise MeshError(path, f"expected glTF with JSON inside, got {short_reason(error)}") from None
     if not isinstance(tree, dict):
         raise MeshError(path, f"expected a glTF object, got a JSON {type(tree).__name__}")
     # Without its decoder the parser fills a compressed mesh with zeros and says nothing.
@@ -300,22 +221,32 @@ def _gltf_notes(path: Path) -> tuple[str, ...]:
     return (f"{' and '.join(still)} in the file are not read: the mesh keeps its rest pose",) if still else ()
 
 
-def _check_size(path: Path) -> None:
-    """Raise for files that are missing, empty or too large to be parsed safely."""
+def check_size(path: Path) -> None:
+    """Raise MeshError for a file that is missing, empty or too large to be parsed safely. Source: ours."""
     try:
         size = path.stat().st_size
     except OSError as error:
-        raise MeshError(path, f"expected a file, got {_reason(error)}") from None
+        raise MeshError(path, f"expected a file, got {short_reason(error)}") from None
     if not path.is_file():
         raise MeshError(path, "expected a file, got something else")
     if not 0 < size <= MAX_FILE_BYTES:
         raise MeshError(path, f"expected 1 to {MAX_FILE_BYTES} bytes, got {size}")
 
 
-def _check_geometry(
-    path: str | Path, vertices: np.ndarray, faces: np.ndarray, n_vertices: int
-) -> tuple[Tensor, Tensor]:
-    """Return vertices (N, 3) float64 and faces (F, 3) int64, or raise: the gate that every mesh passes."""
+def check_geometry(path: str | Path, vertices: np.ndarray, faces: np.ndarray, n_vertices: int) -> tuple[Tensor, Tensor]:
+    """Return vertices (N, 3) float64 and faces (F, 3) int64: the gate that every mesh passes.
+
+    Args:
+        path: for the message.
+        vertices: (N, 3) floats.
+        faces: (F, 3) integers.
+        n_vertices: what the faces may index; less than N if frames follow each other.
+
+    Raises:
+        MeshError: wrong shape or dtype, no triangle, out-of-range index, NaN, inf or too large.
+
+    Source: ours.
+    """
     if faces.ndim != 2 or faces.shape[1] != 3 or faces.dtype.kind not in "iu":
         raise MeshError(path, f"faces: expected (F, 3) integers, got {faces.shape} {faces.dtype}")
     if len(faces) == 0:
@@ -331,8 +262,11 @@ def _check_geometry(
     return torch.from_numpy(np.ascontiguousarray(vertices)), torch.from_numpy(faces.astype(np.int64))
 
 
-def _normalise(path: str | Path, positions: Tensor) -> Tensor:
-    """Return (P, V, 3) positions centred and scaled to a bounding radius of 1."""
+def normalise(path: str | Path, positions: Tensor) -> Tensor:
+    """Return (P, V, 3) positions centred and scaled to a bounding radius of 1, or raise MeshError if all are one point.
+
+    Source: ours.
+    """
     points = positions.reshape(-1, 3)
     centred = positions - (points.amin(0) + points.amax(0)) / 2
     radius = float(centred.norm(dim=-1).max())
@@ -341,12 +275,18 @@ def _normalise(path: str | Path, positions: Tensor) -> Tensor:
     return centred / radius
 
 
-def _file_sha256(path: Path) -> str:
-    """Return the hash of a file's bytes."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+def tensors_sha256(*tensors: Tensor | None) -> bytes:
+    """Return a hash of shapes and values: of what was read, so that textures and buffers beside a file count too.
+
+    Source: ours.
+    """
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(b"none" if tensor is None else str(tuple(tensor.shape)).encode() + tensor.numpy().tobytes())
+    return digest.digest()
 
 
-def _reason(error: BaseException) -> str:
-    """Return an exception as one short line."""
+def short_reason(error: BaseException) -> str:
+    """Return an exception as one short line. Source: ours."""
     text = " ".join(str(error).split())[:200]
     return f"{type(error).__name__}: {text}" if text else type(error).__name__

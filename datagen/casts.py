@@ -60,24 +60,24 @@ def build_cast(rngs: tuple[np.random.Generator, ...], colours: Tensor, aspect: f
     actors = []
     for k, place in enumerate(choose_places(cast_rng, n, aspect)):
         kind = str(cast_rng.choice(KINDS, p=KIND_WEIGHTS))
-        size = float(cast_rng.uniform(0.55, 1.05)) * (1.25 if n < 6 else 1.0)
+        size = float(cast_rng.uniform(0.62, 1.15)) * (1.3 if n < 6 else 1.0)
         shape = build_shape(kind, cast_rng).scaled([size] * 3)
         actors.append(_dress(f"{kind}-{k}", shape, kind, colours, colour_rng, choose_motion(motion_rng, place, size)))
     return actors
 
 
 def choose_places(rng: np.random.Generator, n: int, aspect: float) -> list[Vector]:
-    """Return `n` places spread over the view and in depth, in columns so that they do not all hide each other.
+    """Return `n` places spread over the view and in depth, so that they do not all hide each other.
 
-    Source: ours.
+    Source: Roberts, the R sequence.
     """
-    half = 1.75 * min(max(aspect, 0.6), 2.4)
-    order = rng.permutation(n)
+    half = 1.8 * min(max(aspect, 0.6), 2.4)
+    shift = rng.uniform(size=3)
     places = []
     for k in range(n):
-        x = ((order[k] + float(rng.uniform(0.15, 0.85))) / n * 2 - 1) * half
-        y = float(rng.uniform(-1.25, 1.25))
-        z = float(rng.uniform(-2.2, 0.9))
+        # a sequence whose points keep apart (Roberts' R3), so that no two bodies start in one place
+        even = (shift + (k + 1) * np.array([0.8191725, 0.6710436, 0.5497005])) % 1.0
+        x, y, z = float(even[0] * 2 - 1) * half, float(even[1] * 2 - 1) * 1.45, float(even[2]) * 3.2 - 2.3
         spread = 1 - 0.11 * z  # farther away more fits in
         places.append((x * spread, y * spread, z))
     return places

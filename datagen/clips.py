@@ -72,10 +72,10 @@ def expose(clip: Clip, width: int, height: int, open_s: float, close_s: float) -
         return path.matrices(times_s, width, height)
 
     view = View(matrices, path.is_static, width, height, path.near, open_s, close_s)
-    camera_knots = choose_camera_segments(view, [a.motion for a in clip.actors])
+    camera_knots = choose_camera_segments(view, [(a.motion, a.faces) for a in clip.actors])
     meshes, mesh_knots = [], []
     for actor in clip.actors:
-        knots = choose_mesh_segments(actor.motion, view, camera_knots.segments)
+        knots = choose_mesh_segments((actor.motion, actor.faces), view, camera_knots.segments)
         vertices = actor.motion.at(_knot_times(knots.segments, open_s, close_s))
         meshes.append(_mesh(actor, vertices if knots.segments else vertices[0]))
         mesh_knots.append(knots)

@@ -20,7 +20,7 @@ TOLERANCE_PX = 0.1  # a tenth of a pixel cannot be seen and is far below what th
 CAMERA_SHARE = 0.5  # of the tolerance; the rest is left to the meshes under that camera
 MAX_SEGMENTS = 64  # every segment is one more prism per triangle; reached only by very fast rotation
 MIN_PROBES = 24  # instants at which a motion is compared, however few the segments
-VERTEX_BLOCK = 8192  # vertices compared at a time; bounds the memory at about 100 MB
+PROBE_BLOCK = 16  # instants compared at a time; bounds the memory at about 2 kB a vertex
 
 
 class Moving(Protocol):
@@ -59,50 +59,51 @@ class Knots:
     limit_reached: bool  # the tolerance would need more than MAX_SEGMENTS
 
 
-def choose_camera_segments(view: View, movers: Sequence[Moving]) -> Knots:
+def choose_camera_segments(view: View, bodies: Sequence[tuple[Moving, Tensor]]) -> Knots:
     """Return the fewest segments of the camera that keep its own error under its share of the tolerance.
 
     Args:
         view: the camera and the exposure.
-        movers: what it sees; their motion is taken as exact here.
+        bodies: motion and faces (F, 3) of what it sees; the motion is taken as exact here.
 
     Source: ours.
     """
     if view.is_static:
         return Knots(0, 0.0, False)
-    return _fewest(lambda c: max((chord_error_px(m, view, None, c) for m in movers), default=0.0), CAMERA_SHARE)
+    return _fewest(lambda c: max((chord_error_px(b, view, None, c) for b in bodies), default=0.0), CAMERA_SHARE)
 
 
-def choose_mesh_segments(mover: Moving, view: View, camera_segments: int) -> Knots:
+def choose_mesh_segments(body: tuple[Moving, Tensor], view: View, camera_segments: int) -> Knots:
     """Return the fewest segments of one mesh that keep the error of mesh and camera together under the tolerance.
 
     Args:
-        mover: the mesh's motion.
+        body: the mesh's motion and faces (F, 3).
         view: the camera and the exposure.
         camera_segments: as chosen for the camera.
 
     Source: ours.
     """
-    if mover.is_static:
-        error = chord_error_px(mover, view, 0, camera_segments)
+    if body[0].is_static:
+        error = chord_error_px(body, view, 0, camera_segments)
         return Knots(0, error, error > TOLERANCE_PX)
-    return _fewest(lambda k: chord_error_px(mover, view, k, camera_segments), 1.0)
+    return _fewest(lambda k: chord_error_px(body, view, k, camera_segments), 1.0)
 
 
-def chord_error_px(mover: Moving, view: View, mesh_segments: int | None, camera_segments: int) -> float:
+def chord_error_px(body: tuple[Moving, Tensor], view: View, mesh_segments: int | None, camera_segments: int) -> float:
     """Return the largest screen distance [px] between the exact motion and what torchblur makes of the knots.
 
-    A vertex on the screen counts with its exact distance. One outside, or nearer than the near plane, counts with
-    the most that an edge to it can move anything on the screen, to first order.
+    Vertices count while a face of theirs may be seen. One on the screen counts with its exact distance; one outside,
+    or nearer than the near plane, with the most that an edge to it can move anything on the screen, to first order.
 
     Args:
-        mover: the mesh's motion.
+        body: the mesh's motion and faces (F, 3).
         view: the camera and the exposure.
         mesh_segments: 0 for a static mesh; None takes the mesh's motion as exact (the camera's error alone).
         camera_segments: 0 for a static camera.
 
     Source: ours.
     """
+    mover, faces = body
     n = max(mesh_segments or 0, camera_segments, 1)
     inner = max(3, -(-MIN_PROBES // n))
     per_segment = (torch.arange(inner, dtype=torch.float64) + 1) / (inner + 1)
@@ -126,23 +127,40 @@ def chord_error_px(mover: Moving, view: View, mesh_segments: int | None, camera_
         world = mover.at(seconds(torch.linspace(0, 1, mesh_segments + 1, dtype=torch.float64)))
         chord_world, chord_matrix, chord = _lerp(world, ends), _lerp(matrix, ends), places
     worst = 0.0
-    for block in range(0, exact_world.shape[1], VERTEX_BLOCK):
-        rows = slice(block, block + VERTEX_BLOCK)
-        exact = _to_clip(exact_world[:, rows], exact_matrix)
-        near = _to_clip(chord_world[:, rows], chord_matrix)
-        worst = max(worst, _screen_distance_px(exact, near if chord is None else _lerp(near, chord), view))
+    for first in range(0, len(places), PROBE_BLOCK):  # bounds the memory
+        block = slice(first, first + PROBE_BLOCK)
+        exact = _to_clip(exact_world[block], exact_matrix[block])
+        if chord is None:
+            near = _to_clip(chord_world[block], chord_matrix[block])
+        else:
+            near = _lerp(_to_clip(chord_world, chord_matrix), chord[block])
+        distance = _screen_distance_px(exact, near, view)
+        worst = max(worst, float(torch.where(_may_be_seen(exact, faces), distance, 0.0).max()))
     return worst
 
 
-def _screen_distance_px(exact: Tensor, chord: Tensor, view: View) -> float:
-    """Return the largest distance [px] between clip positions (N, V, 4), as `chord_error_px` explains."""
+def _may_be_seen(clip: Tensor, faces: Tensor) -> Tensor:
+    """Return (N, V) whether some face of the vertex is not wholly beyond one side of the view, from clip (N, V, 4)."""
+    x, y, z, w = clip.unbind(-1)
+    sides = (x > w, x < -w, y > w, y < -w, z < -w, z > w)
+    code = sum(side.to(torch.uint8) << k for k, side in enumerate(sides))
+    a, b, c = faces.unbind(-1)
+    kept = (code[:, a] & code[:, b] & code[:, c]) == 0  # (N, F)
+    seen = torch.zeros_like(code)
+    for corner in (a, b, c):
+        seen.scatter_reduce_(1, corner.expand_as(kept), kept.to(torch.uint8), "amax")
+    return seen > 0
+
+
+def _screen_distance_px(exact: Tensor, chord: Tensor, view: View) -> Tensor:
+    """Return (N, V) distances [px] between clip positions (N, V, 4), as `chord_error_px` explains."""
     w = exact[..., 3:].clamp(min=view.near)
     chord_w = chord[..., 3:].clamp(min=view.near)
     ndc = (exact[..., :2] / w).clamp(-1, 1)
     error = chord - exact
     ndc_error = (error[..., :2] - ndc * error[..., 3:]) / chord_w
     half = torch.tensor([view.width / 2, view.height / 2], dtype=torch.float64)
-    return float((ndc_error * half).norm(dim=-1).max()) if ndc_error.numel() else 0.0
+    return (ndc_error * half).norm(dim=-1)
 
 
 def _fewest(error_of: Callable[[int], float], share: float) -> Knots:

@@ -54,7 +54,7 @@ def paint(shape: Shape, colours: Tensor, pattern: str, rng: np.random.Generator)
         shape: what to paint.
         colours: (C, 3) linear, C >= 2; the pattern takes the first ones.
         pattern: one of PATTERNS.
-        rng: where the pattern's scale and seed come from.
+        rng: where the pattern's scale and chance come from.
 
     Raises:
         ValueError: an unknown pattern.
@@ -62,32 +62,56 @@ def paint(shape: Shape, colours: Tensor, pattern: str, rng: np.random.Generator)
     Source: ours.
     """
     u, v = shape.cell_uv.unbind(-1)
-    scale = int(rng.integers(2, 7))
+    i, j = cell_numbers(shape, rng)
     first, second = colours[0], colours[1]
     if pattern == "checker":
-        share = (torch.floor(u * 2 * scale) + torch.floor(v * scale)) % 2
+        share = (i + j) % 2
     elif pattern == "stripes":
-        share = torch.floor(u * 2 * scale) % 2
+        share = i % 2
     elif pattern == "bands":
-        share = torch.floor(v * 2 * scale + u * int(rng.integers(0, 3)) * 2) % 2
+        share = (j + i * int(rng.integers(0, 2))) % 4 // 2
     elif pattern == "gradient":
         share = v if rng.random() < 0.5 else (1 - torch.cos(u * 2 * torch.pi)) / 2
     elif pattern == "noise":
-        share = smooth_noise(shape.centres() * (1.0 + 0.5 * scale), rng)
+        share = smooth_noise(cell_centres(shape) * float(rng.uniform(1.5, 4.0)), rng)
         share = ((share - 0.25) * 2).clamp(0, 1)
     elif pattern == "patches":
-        rows = torch.floor(u * 2 * scale).long() * 64 + torch.floor(v * scale).long()
         choice = torch.from_numpy(rng.integers(0, len(colours), 64 * 64))
-        return colours[choice[rows % len(choice)]]
+        return colours[choice[(i % 64) * 64 + j % 64]]
     elif pattern == "spots":
-        du, dv = (u * 2 * scale) % 1 - 0.5, (v * scale) % 1 - 0.5
-        share = (du * du + dv * dv < 0.1).to(torch.float64)
+        share = (i % 2) * (j % 2)
     elif pattern == "plain":
         share = torch.zeros_like(u)
     else:
         raise ValueError(f"pattern: expected one of {', '.join(PATTERNS)}, got {pattern!r}")
-    share = share.unsqueeze(-1)
+    share = share.to(torch.float64).unsqueeze(-1)
     return first * (1 - share) + second * share
+
+
+def cell_numbers(shape: Shape, rng: np.random.Generator) -> tuple[Tensor, Tensor]:
+    """Return (F,) int64 column and row of each face in a grid of pattern cells, whole cells of the shape each.
+
+    Args:
+        shape: its cells lie on a regular grid, or anywhere, as on a polyhedron.
+        rng: how many of the shape's cells make one of the pattern's.
+
+    Source: ours.
+    """
+    numbers = []
+    for place in shape.cell_uv.unbind(-1):
+        n = round(0.5 / max(float(place.min()), 0.01))  # the first cell's middle is half a cell from the edge
+        steps = [s for s in (1, 2, 3) if n % (2 * s) == 0 and n // s >= 4] or [1]  # even, so that a seam fits
+        numbers.append(torch.floor(place * n).long() // int(rng.choice(steps)))
+    return numbers[0], numbers[1]
+
+
+def cell_centres(shape: Shape) -> Tensor:
+    """Return (F, 3) centres of the faces' cells: of the quad where two faces share one. Source: ours."""
+    centres = shape.centres()
+    uv = shape.cell_uv
+    if len(uv) % 2 or not torch.equal(uv[::2], uv[1::2]):
+        return centres
+    return ((centres[::2] + centres[1::2]) / 2).repeat_interleave(2, 0)
 
 
 def light(shape: Shape, colours: Tensor, two_sided: bool = False) -> Tensor:

@@ -15,12 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datagen.assets import Roster, load_mesh, load_sequence, survey_meshes, survey_sequence
+from datagen.assets import Roster, load_mesh, survey_meshes
 from datagen.casts import build_cast, choose_motion, choose_places
 from datagen.clips import Actor, Clip
 from datagen.motions import PlayedVertices, RigidBody, turns
 from datagen.patterns import light, paint, palette_colours
 from datagen.seeds import open_stream
+from datagen.sequences import load_sequence, survey_sequence
 from datagen.shapes import Shape
 from datagen.spec import DatasetSpec, parse_spec
 from datagen.stages import choose_stage

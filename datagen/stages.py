@@ -23,9 +23,9 @@ from datagen.shapes import Shape, box, sheet
 VIEW_HEIGHT = 4.0  # [scene units] seen at the origin, from top to bottom
 REFERENCE_S = 1 / 48  # half of a frame time at 24 fps: a cinema camera's usual exposure
 CAMERA_KINDS = ("still", "truck", "dolly", "orbit", "pan", "shake")
-CAMERA_WEIGHTS = (0.22, 0.18, 0.14, 0.16, 0.14, 0.16)
+CAMERA_WEIGHTS = (0.18, 0.18, 0.16, 0.18, 0.14, 0.16)
 BACKDROP_KINDS = ("room", "wall", "ground", "gradient", "clouds", "flat")
-BACKDROP_WEIGHTS = (0.30, 0.22, 0.22, 0.12, 0.10, 0.04)
+BACKDROP_WEIGHTS = (0.30, 0.26, 0.24, 0.10, 0.07, 0.03)
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ def choose_camera(rng: np.random.Generator, aspect: float) -> tuple[CameraPath, 
         eye=Path(eye, sways=eye_sways),
         target=Path((0.0, 0.0, 0.0), sways=target_sways),
         fov_y_deg=fov_deg,
-        near=0.25,
+        near=0.3,
         far=100.0,
         roll_rad=roll_rad,
         roll_rate_rad_s=roll_rate,

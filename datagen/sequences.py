@@ -1,0 +1,110 @@
+"""Sequences: one mesh whose vertices move from frame to frame, from a `.npz`, a folder of files or one mesh file.
+
+Before: assets.py.  After: scenes.py.
+Symbols: V vertices, F faces, P frames.
+"""
+
+from __future__ import annotations
+
+import functools
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datagen.assets import (
+    MESH_SUFFIXES,
+    MeshError,
+    Roster,
+    check_geometry,
+    check_size,
+    normalise,
+    parse_mesh,
+    short_reason,
+    tensors_sha256,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceAsset:
+    """Frames of one mesh, moved to the origin and scaled so that all of them fit a radius of 1."""
+
+    name: str
+    positions: Tensor  # (P, V, 3) float64
+    faces: Tensor  # (F, 3) int64
+    color: Tensor | None  # (F, 3) float64 linear, or none
+    notes: tuple[str, ...]
+
+
+def survey_sequence(path: str | Path) -> Roster:
+    """Read a sequence once and return its hash.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    asset = load_sequence(str(path))
+    digest = tensors_sha256(asset.positions, asset.faces, asset.color).hex()
+    return Roster((asset.name,), (), digest)
+
+
+@functools.lru_cache(maxsize=2)
+def load_sequence(path: str) -> SequenceAsset:
+    """Return a sequence: a `.npz` with `vertices` (P, V, 3) and `faces` (F, 3), a folder of mesh files with equal
+    faces (one per frame, in the order of the numbers in their names), or one mesh file, which stands still.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    place = Path(path)
+    if place.is_dir():
+        return _load_frames(place)
+    if place.suffix.lower() != ".npz":
+        vertices, faces, color, _, notes = parse_mesh(place)
+        note = "one mesh file: a single frame, so the mesh itself stands still"
+        return SequenceAsset(place.name, normalise(path, vertices[None]), faces, color, (*notes, note))
+    check_size(place)
+    try:
+        with np.load(place, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in ("vertices", "faces") if name in archive.files}
+    except (OSError, ValueError, KeyError, EOFError, NotImplementedError, SyntaxError) as error:
+        raise MeshError(path, f"expected a readable .npz file without pickles, got {short_reason(error)}") from None
+    except Exception as error:  # zipfile and zlib raise their own kinds on broken archives
+        raise MeshError(path, f"expected a readable .npz file, got {short_reason(error)}") from None
+    for name in ("vertices", "faces"):
+        if name not in arrays:
+            raise MeshError(path, f"{name}: expected an array of that name, got none")
+    positions, faces = arrays["vertices"], arrays["faces"]
+    if positions.ndim != 3 or positions.shape[-1] != 3 or positions.dtype.kind != "f":
+        raise MeshError(path, f"vertices: expected (frames, V, 3) float, got {positions.shape} {positions.dtype}")
+    if len(positions) < 1:
+        raise MeshError(path, "vertices: expected at least one frame, got none")
+    checked = check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
+    return SequenceAsset(place.name, normalise(path, checked[0].reshape(positions.shape)), checked[1], None, ())
+
+
+def _load_frames(folder: Path) -> SequenceAsset:
+    """Return the mesh files of a folder as the frames of one mesh."""
+    names = _frame_names(folder)
+    if not names:
+        raise MeshError(folder, f"expected frames as {', '.join(MESH_SUFFIXES)} files, got none")
+    frames, first = [], None
+    for name in names:
+        vertices, faces, color, _, notes = parse_mesh(folder / name)
+        first = first or (faces, color, notes)
+        if not torch.equal(faces, first[0]) or (frames and vertices.shape != frames[0].shape):
+            raise MeshError(folder / name, f"expected the vertices and faces of {names[0]}, got others")
+        frames.append(vertices)
+    return SequenceAsset(folder.name, normalise(folder, torch.stack(frames)), first[0], first[1], first[2])
+
+
+def _frame_names(folder: Path) -> list[str]:
+    """Return the mesh files directly in a folder, ordered by the numbers in their names."""
+    names = [p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES and p.is_file()]
+    return sorted(names, key=lambda n: ([int(d) for d in re.findall(r"\d+", n)], n))

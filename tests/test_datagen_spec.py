@@ -1,0 +1,109 @@
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from datagen.seeds import open_stream
+from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields, spec_to_toml
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("width", 0),
+        ("width", "64"),
+        ("height", 2.5),
+        ("count", -1),
+        ("count", True),
+        ("seed", -3),
+        ("source", "video"),
+        ("frames_per_clip", 0),
+        ("fps", 0.0),
+        ("fps", float("nan")),
+        ("exposure", 0.0),
+        ("exposure", 1.5),
+        ("rays_per_pixel", 0),
+        ("sequence_fps", float("inf")),
+        ("workers", 2),  # how it is made is no part of what is made
+        ("assets", "somewhere"),  # the built-in shapes have none
+    ],
+)
+def test_a_wrong_field_is_refused_by_name(field, value):
+    with pytest.raises(SpecError) as caught:
+        parse_spec({field: value})
+    assert len(caught.value.problems) == 1
+    assert caught.value.problems[0].startswith(f"{field}: expected ")
+    assert ", got " in caught.value.problems[0]
+
+
+def test_all_wrong_fields_are_reported_at_once():
+    with pytest.raises(SpecError) as caught:
+        parse_spec({"width": -1, "exposure": 7.0, "colour": "red", "source": "meshes"})
+    named = sorted(p.split(":")[0] for p in caught.value.problems)
+    assert named == ["assets", "colour", "exposure", "width"]
+
+
+def test_assets_must_exist_and_fit_the_source(tmp_path):
+    file = tmp_path / "clip.npz"
+    file.write_bytes(b"x")
+    other = tmp_path / "clip.txt"
+    other.write_bytes(b"x")
+    assert parse_spec({"source": "sequence", "assets": str(file)}).assets == str(file)
+    assert parse_spec({"source": "meshes", "assets": str(tmp_path)}).assets == str(tmp_path)
+    for source, assets in [("meshes", str(file)), ("sequence", str(other)), ("sequence", str(tmp_path / "none.npz"))]:
+        with pytest.raises(SpecError, match="assets: expected"):
+            parse_spec({"source": source, "assets": assets})
+
+
+def test_toml_round_trip(tmp_path):
+    spec = parse_spec({"width": 31, "exposure": 0.25, "seed": 2**62, "source": "meshes", "assets": str(tmp_path)})
+    path = tmp_path / "run.toml"
+    path.write_text(spec_to_toml(spec), encoding="utf-8")
+    assert parse_spec(read_spec_fields(path)) == spec
+    path.write_text("width = [", encoding="utf-8")
+    with pytest.raises(SpecError, match="config: expected"):
+        read_spec_fields(path)
+
+
+def test_a_specification_cannot_be_changed():
+    spec = parse_spec({})
+    with pytest.raises(Exception, match="frozen"):
+        spec.width = 3
+
+
+def test_the_hash_leaves_out_count_and_the_place_of_assets_only(tmp_path):
+    base = parse_spec({})
+    assert parse_spec({"count": 99}).config_sha256() == base.config_sha256()
+    changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
+               "rays_per_pixel": 1, "sequence_fps": 12.0}  # fmt: skip
+    hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}
+    assert len(hashes) == len(changed) + 1
+    assert set(changed) == set(DatasetSpec.model_fields) - {"count", "assets", "source"}
+    assert base.config_sha256("a") != base.config_sha256("b")
+
+
+def test_frames_belong_to_clips_in_order():
+    spec = parse_spec({"frames_per_clip": 3})
+    assert [spec.clip_and_frame(i) for i in (0, 2, 3, 7)] == [(0, 0), (0, 2), (1, 0), (2, 1)]
+
+
+def test_streams_are_stateless_and_all_different():
+    draw = [open_stream(7, s, c).random() for s in ("cast", "motion") for c in range(50)]
+    assert len(set(draw)) == 100
+    assert open_stream(7, "motion", 31).random() == draw[50 + 31]
+    child = np.random.SeedSequence(7, spawn_key=(2, 31))
+    assert open_stream(7, "cast", 31).random() == np.random.Generator(np.random.Philox(child)).random()
+    with pytest.raises(ValueError, match="stream: expected"):
+        open_stream(7, "sound", 0)
+
+
+def test_help_does_not_wait_for_torch():
+    code = (
+        "import sys; from datagen.__main__ import main; rc = main(['--help']);"
+        "import json; print(json.dumps([rc, 'torch' in sys.modules]), file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert json.loads(done.stderr) == [0, False]
+    assert "--frames-per-clip" in done.stdout

@@ -149,6 +149,9 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
         raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
     if not parts:
         raise MeshError(path, "expected triangles, got none")
+    announced, found = _announced_faces(path), sum(len(p[1]) for p in parts)
+    if found < announced:  # the parser takes a text file that was cut short for a smaller mesh
+        raise MeshError(path, f"expected {announced} faces as its header says, got {found}")
     checked = [check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
     starts = np.cumsum([0, *[len(v) for v, _ in checked]])
     faces = torch.cat([f + int(start) for (_, f), start in zip(checked, starts, strict=False)])
@@ -159,6 +162,16 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
     color = None if rgba is None else linear_from_srgb(rgba[:, :3].contiguous())
     opacity = rgba[:, 3].contiguous() if rgba is not None and bool((rgba[:, 3] < 1).any()) else None
     return torch.cat([v for v, _ in checked]), faces, color, opacity, notes
+
+
+def _announced_faces(path: Path) -> int:
+    """Return how many faces the header of a PLY file promises; 0 for other files."""
+    if path.suffix.lower() != ".ply":
+        return 0
+    with path.open("rb") as file:
+        header = file.read(65536).split(b"end_header")[0]
+    match = re.search(rb"element\s+face\s+(\d+)", header)
+    return int(match[1]) if match else 0
 
 
 def _part(scene: Any, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:

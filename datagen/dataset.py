@@ -65,9 +65,12 @@ class BlurDataset(Dataset[dict[str, Any]]):
         self.folder = Path(folder)
         self.keys = tuple(known if keys is None else keys)
         try:
-            self.indices = tuple(read_manifest(folder))
+            entries = read_manifest(folder)
         except FileNotFoundError:
             raise FileNotFoundError(f"folder: expected a data set with a manifest.jsonl, got {str(folder)!r}") from None
+        self.indices = tuple(entries)
+        sums = [file["sha256"] for e in entries.values() for file in e["files"] if file["path"].endswith(".exr")]
+        self._sums = np.array(sums, dtype="S64")  # one array, as millions of texts would be slow to send to workers
         if not self.indices:
             raise ValueError(f"folder: expected at least one finished frame, got none in {str(folder)!r}")
 
@@ -83,8 +86,7 @@ class BlurDataset(Dataset[dict[str, Any]]):
             FrameFileError: the file is missing or damaged; it is named.
         """
         index = self.indices[item]
-        path = self.folder / frame_paths(index)["exr"]
-        parts, meta = read_exr(path)
+        path, parts, meta = self._read(item)
         result: dict[str, Any] = {"index": index, "meta": json.dumps(meta, sort_keys=True)}
         try:
             for key in self.keys:
@@ -104,7 +106,7 @@ class BlurDataset(Dataset[dict[str, Any]]):
 
         Source: ours.
         """
-        parts, _ = read_exr(self.folder / frame_paths(self.indices[item])["exr"])
+        _, parts, _ = self._read(item)
         planes = parts.get("coverage", {})
         if not planes:
             return torch.zeros(0, *parts["data"]["A"].shape)
@@ -112,7 +114,12 @@ class BlurDataset(Dataset[dict[str, Any]]):
 
     def metadata(self, item: int) -> dict[str, Any]:
         """Return the metadata of a frame as a dict. Source: ours."""
-        return read_exr(self.folder / frame_paths(self.indices[item])["exr"])[1]
+        return self._read(item)[2]
+
+    def _read(self, item: int) -> tuple[Path, dict[str, dict[str, np.ndarray]], dict[str, Any]]:
+        """Return a frame's path, parts and metadata, its bytes checked against the manifest."""
+        path = self.folder / frame_paths(self.indices[item])["exr"]
+        return (path, *read_exr(path, self._sums[item].decode()))
 
 
 def _stack(parts: dict[str, dict[str, np.ndarray]], part: str, channels: tuple[str, ...]) -> Tensor:

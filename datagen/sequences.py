@@ -71,7 +71,7 @@ def load_sequence(path: str) -> SequenceAsset:
         return SequenceAsset(place.name, normalise(path, vertices[None]), faces, color, (*notes, note))
     check_size(place)
     try:
-        with np.load(place, allow_pickle=False) as archive:
+        with place.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in ("vertices", "faces") if name in archive.files}
     except (OSError, ValueError, KeyError, EOFError, NotImplementedError, SyntaxError) as error:
         raise MeshError(path, f"expected a readable .npz file without pickles, got {short_reason(error)}") from None

@@ -131,8 +131,12 @@ def encode_exr(parts: Mapping[str, Mapping[str, np.ndarray]], meta: Mapping[str,
     return buffer.getvalue()
 
 
-def read_exr(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, Any]]:
+def read_exr(path: str | Path, sha256: str | None = None) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, Any]]:
     """Return the parts and the metadata that `encode_exr` stored.
+
+    Args:
+        path: of the file.
+        sha256: what the manifest says of its bytes. Without it, damage to parts that did not shrink goes unnoticed.
 
     Raises:
         FrameFileError: the file is missing, cut short, damaged or not one of ours; it is named.
@@ -143,6 +147,8 @@ def read_exr(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[s
         data = Path(path).read_bytes()
     except OSError as error:
         raise FrameFileError(f"{path}: expected a frame, got {type(error).__name__}: {error.strerror}") from None
+    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
+        raise FrameFileError(f"{path}: expected the bytes that the manifest lists, got a damaged file")
     try:
         file = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         # A damaged file does not raise: it comes back with no parts.

@@ -18,8 +18,7 @@ from torch import Tensor
 from torchblur import bernstein, packed
 from torchblur.intervals import Intervals, attach_gradient, nearness_at
 from torchblur.prisms import Prisms
-from torchblur.sort import argsort_by, inverse, reorder_ties
-from torchblur.surfaces import TIE
+from torchblur.sort import argsort_by, inverse, is_tied, reorder_ties
 
 CROSSING_NOISE = 1e-12  # of the largest product: smaller coefficients of F are rounding
 MIN_CELL = 1e-12  # shutter time: shorter cells are not searched for crossings; a pixel changes by at most as much
@@ -122,26 +121,46 @@ def _stack_layers(prisms: Prisms, intervals: Intervals, crossings: Crossings | N
     first, last, instant_t, instant_pixel = _instants(intervals, crossings)
     with torch.no_grad():
         cell, interval = packed.expand(first, last - first)
-        middle = 0.5 * (instant_t[cell] + instant_t[cell + 1])
-        u = _local(intervals, interval, middle)
-        num = bernstein.value(intervals.near_num[:, interval], u)
-        den = bernstein.value(intervals.near_den[:, interval], u)
-        nearness = torch.where(den != 0, num / torch.where(den != 0, den, 1.0), torch.inf)
-        order = argsort_by(cell, -nearness)
-        tied = torch.zeros_like(order, dtype=torch.bool)
-        step = nearness[order].diff().abs()
-        tied[1:] = (cell[order].diff() == 0) & (step <= TIE * nearness[order][1:].abs())
+        order = _depth_order(prisms, intervals, (cell, interval), (instant_t[cell], instant_t[cell + 1]))
         face = prisms.face_of[intervals.prism]
-        order = reorder_ties(order, tied, prisms.surfaces.tie_rank[face][interval])
         cell, interval = cell[order], interval[order]
 
-        is_last = torch.ones_like(tied)
+        is_last = torch.ones_like(cell, dtype=torch.bool)
         is_last[:-1] = cell[1:] != cell[:-1]
         opacity = prisms.surfaces.opacity
         ends = is_last if opacity.requires_grad else is_last | (opacity[face] == 1)[interval]
         place = torch.where(ends, torch.arange(len(cell), device=cell.device), len(cell))
         last_seen = torch.full_like(instant_pixel, len(cell)).scatter_reduce(0, cell, place, "amin")[cell]
     return _Layers(cell, interval, last_seen, instant_t, instant_pixel)
+
+
+def _depth_order(
+    prisms: Prisms, intervals: Intervals, layers: tuple[Tensor, Tensor], times: tuple[Tensor, Tensor]
+) -> Tensor:
+    """Return the order of layers (cell, interval) by cell, then nearest first at the midpoint of the cell's `times`.
+
+    Surfaces that meet at the midpoint may only touch there: a second point decides. Those that meet there too are
+    coplanar, and the content of the faces decides.
+    """
+    cell, interval = layers
+    nearness = _nearness(intervals, interval, 0.5 * (times[0] + times[1]))
+    order = argsort_by(cell, -nearness)
+    tied = is_tied(cell[order], nearness[order])
+    if not tied.any():
+        return order
+    group = torch.cumsum((~tied).long(), 0)
+    second = _nearness(intervals, interval, 0.75 * times[0] + 0.25 * times[1])
+    inner = argsort_by(group, -second[order])
+    order, group = order[inner], group[inner]
+    rank = prisms.surfaces.tie_rank[prisms.face_of[intervals.prism[interval]]]
+    return reorder_ties(order, is_tied(group, second[order]), rank)
+
+
+def _nearness(intervals: Intervals, interval: Tensor, t: Tensor) -> Tensor:
+    """Return the nearness (K,) of intervals at shutter times `t`, inf where an edge-on surface has none."""
+    u = _local(intervals, interval, t)
+    num, den = (bernstein.value(c[:, interval], u) for c in (intervals.near_num, intervals.near_den))
+    return torch.where(den != 0, num / torch.where(den != 0, den, 1.0), torch.inf)
 
 
 def _local(intervals: Intervals, interval: Tensor, t: Tensor) -> Tensor:

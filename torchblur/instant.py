@@ -17,8 +17,8 @@ from torch import Tensor
 from torchblur import check, packed
 from torchblur.camera import clip_to_px, pixel_rays, project_world
 from torchblur.scene import Mesh, Scene
-from torchblur.sort import argsort_by, reorder_ties
-from torchblur.surfaces import TIE, Surfaces, build_surfaces
+from torchblur.sort import argsort_by, is_tied, reorder_ties
+from torchblur.surfaces import Surfaces, build_surfaces
 
 MAX_PAIRS = 2_000_000  # pairs of triangle and pixel looked at together: about 1 GB of working memory
 MAX_RAYS = 4096
@@ -160,7 +160,7 @@ def _displacement_px(scene: Scene, visible: tuple[Tensor, Tensor, Tensor], t: fl
         weight = bary[row, column]
         weight = torch.cat([1 - weight.sum(1, keepdim=True), weight], dim=1)
         place = clip_to_px((weight.unsqueeze(2) * corners).sum(1), w, h)
-        centre = torch.stack([column, row], dim=1) + 0.5
+        centre = torch.stack([column, row], dim=1).to(torch.float64) + 0.5
         out = out.index_put((row, column), place - centre)
     return out
 
@@ -266,8 +266,8 @@ def _rasterise(
     local, triangle = packed.expand(torch.zeros_like(count), count)
     column = box[0][triangle] + local % box[2][triangle]
     row = box[1][triangle] + local // box[2][triangle]
-    x_ndc = 2 * (column + ray_px[0]) / camera.width - 1
-    y_ndc = 1 - 2 * (row + ray_px[1]) / camera.height
+    x_ndc = 2 * (column.to(torch.float64) + ray_px[0]) / camera.width - 1
+    y_ndc = 1 - 2 * (row.to(torch.float64) + ray_px[1]) / camera.height
     sign = _inside(clip.detach(), triangle, (x_ndc, y_ndc))
     front_only = surfaces.is_one_sided[triangle % n_faces]
     kept = ((sign != 0) & ~(front_only & (sign < 0))).nonzero().flatten()
@@ -283,9 +283,7 @@ def _rasterise(
     face = triangle % n_faces
     nearness = 1 / w_hit if camera.is_perspective else 2 - z_hit / w_hit
     order = argsort_by(owner, -nearness.detach())
-    tied = torch.zeros_like(order, dtype=torch.bool)
-    step = nearness.detach()[order].diff().abs()
-    tied[1:] = (owner[order].diff() == 0) & (step <= TIE * nearness.detach()[order][1:].abs())
+    tied = is_tied(owner[order], nearness.detach()[order])
     order = reorder_ties(order, tied, surfaces.tie_rank[face])
     depth = w_hit
     if not camera.is_perspective:

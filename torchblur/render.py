@@ -71,7 +71,7 @@ def render(
     accuracy: Accuracy | None = None,
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
-    memory_bytes: int = 1 << 30,
+    memory_bytes: int = 1 << 28,
 ) -> Frame:
     """Return the mean of `scene` over the shutter's window, exact in time, without samples or noise.
 

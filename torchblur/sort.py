@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+TIE = 1e-11  # relative: nearness of surfaces that count as coplanar (float64 rounding, with room for thin triangles)
+
 
 def argsort_by(*keys: Tensor) -> Tensor:
     """Return the stable order by the first key, then the second, and so on (N,) int64; all ascending. Source: ours."""
@@ -26,6 +28,13 @@ def inverse(order: Tensor) -> Tensor:
     place = torch.zeros_like(order)
     place[order] = torch.arange(len(order), device=order.device)
     return place
+
+
+def is_tied(owner_of: Tensor, value: Tensor) -> Tensor:
+    """Return (N,) bool, whether a value all but equals the one before it of the same owner. Source: ours."""
+    tied = torch.zeros_like(owner_of, dtype=torch.bool)
+    tied[1:] = (owner_of.diff() == 0) & (value.diff().abs() <= TIE * value[1:].abs())
+    return tied
 
 
 def reorder_ties(order: Tensor, tied_to_previous: Tensor, rank: Tensor) -> Tensor:

@@ -14,8 +14,6 @@ from torch import Tensor
 
 from torchblur.scene import Mesh, Scene
 
-TIE = 1e-11  # relative nearness: closer surfaces are coplanar (float64 rounding of 1 / w with room for thin triangles)
-
 
 @dataclass(frozen=True)
 class Surfaces:

@@ -9,6 +9,7 @@ from hypothesis import settings
 
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=25)
 settings.load_profile("fixed")
+torch.set_num_threads(1)  # the tensors of tests are tiny: threads would only wait for each other
 
 
 @pytest.fixture(params=["cpu", "cuda"])
@@ -29,3 +30,9 @@ def dtype(request: pytest.FixtureRequest) -> torch.dtype:
 def rng() -> np.random.Generator:
     """Return a generator that gives the same numbers to every test."""
     return np.random.default_rng(20240607)
+
+
+@pytest.fixture
+def generator() -> torch.Generator:
+    """Return a torch generator that gives the same numbers to every test."""
+    return torch.Generator().manual_seed(20240607)

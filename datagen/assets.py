@@ -95,18 +95,32 @@ def survey_meshes(folder: str | Path) -> Roster:
     return Roster(tuple(names), tuple(refused), digest.hexdigest())
 
 
-@functools.lru_cache(maxsize=16)  # clips of a worker draw from the same few files
 def load_mesh(path: str) -> MeshAsset:
-    """Return a mesh file, checked and normalised.
+    """Return a mesh file, checked and normalised; one that has not changed since is not read again.
 
     Raises:
         MeshError: not readable, no triangles, NaN, out-of-range indices or values, too large, no extent.
 
     Source: ours.
     """
+    return _load_mesh(path, file_state(Path(path)))
+
+
+@functools.lru_cache(maxsize=16)  # clips of a worker draw from the same few files
+def _load_mesh(path: str, state: tuple[int, int]) -> MeshAsset:
+    """Return the mesh of a file in a certain state."""
     vertices, faces, color, opacity, notes = parse_mesh(Path(path))
     vertices = normalise(path, vertices[None])[0]
     return MeshAsset(Path(path).name, vertices, faces, color, opacity, notes)
+
+
+def file_state(path: Path) -> tuple[int, int]:
+    """Return time of change [ns] and size [bytes] of a file or folder, or raise MeshError. Source: ours."""
+    try:
+        found = path.stat()
+    except OSError as error:
+        raise MeshError(path, f"expected a file, got {short_reason(error)}") from None
+    return found.st_mtime_ns, found.st_size
 
 
 def _files_under(folder: str | Path) -> list[str]:

@@ -25,6 +25,7 @@ class Progress:
 
     def __init__(self, total: int, already: int = 0, is_quiet: bool = False) -> None:
         self.total, self.already, self.done, self.failed = total, already, 0, 0
+        self.written = 0  # frames told of by the last line
         self.is_quiet = is_quiet
         self.start_s = self.line_s = time.monotonic()
         show = sys.stderr.isatty() and not is_quiet
@@ -38,7 +39,7 @@ class Progress:
     ) -> None:
         if self.bar is not None:
             self.bar.close()
-        elif self.done + self.failed:
+        elif self.done + self.failed > self.written:
             self._write_line()
 
     def step(self, is_done: bool) -> None:
@@ -64,7 +65,7 @@ class Progress:
     def _write_line(self) -> None:
         """Write how far the run is as one line."""
         self.line_s = time.monotonic()
-        steps = self.done + self.failed
+        steps = self.written = self.done + self.failed
         rate = steps / max(self.line_s - self.start_s, 1e-9)
         left_s = (self.total - self.already - steps) / rate if rate else float("inf")
         place = f"{self.already + steps}/{self.total} frames"

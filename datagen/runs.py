@@ -66,8 +66,8 @@ def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: boo
         todo = [i for i in range(spec.count) if i not in entries]
         failed = []
         with Progress(spec.count, kept, is_quiet) as progress:
-            for name, reason in roster.refused:
-                progress.say(f"refused {name}: {reason}")
+            if roster.refused:
+                progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
             text = plan.to_json()
             if workers <= 1:
                 outcomes = run_serial(make_frame, text, str(folder), todo)

@@ -21,6 +21,7 @@ from datagen.assets import (
     Roster,
     check_geometry,
     check_size,
+    file_state,
     normalise,
     parse_mesh,
     short_reason,
@@ -52,7 +53,6 @@ def survey_sequence(path: str | Path) -> Roster:
     return Roster((asset.name,), (), digest)
 
 
-@functools.lru_cache(maxsize=2)
 def load_sequence(path: str) -> SequenceAsset:
     """Return a sequence: a `.npz` with `vertices` (P, V, 3) and `faces` (F, 3), a folder of mesh files with equal
     faces (one per frame, in the order of the numbers in their names), or one mesh file, which stands still.
@@ -62,6 +62,14 @@ def load_sequence(path: str) -> SequenceAsset:
 
     Source: ours.
     """
+    place = Path(path)
+    files = sorted(place.iterdir()) if place.is_dir() else [place]
+    return _load_sequence(path, tuple(file_state(file) for file in files))
+
+
+@functools.lru_cache(maxsize=2)  # every clip plays the same one
+def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAsset:
+    """Return the sequence of files in certain states."""
     place = Path(path)
     if place.is_dir():
         return _load_frames(place)

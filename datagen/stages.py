@@ -124,7 +124,7 @@ def choose_stage(
         inside = Shape(shape.vertices, shape.faces.flip(1), shape.cell_uv, True)
         actors = (_still("room", inside, paint(inside, pair, _quiet(rng), rng)),)
     elif kind == "wall":
-        shape = sheet(26, 0.0, 0.6).scaled((9.0, 9.0, 1.0))
+        shape = sheet(32, 0.0, 0.7).scaled((12.0, 12.0, 1.0))  # beyond the view from every eye
         actors = (_still("wall", shape, paint(shape, pair, _quiet(rng), rng), (0.0, 0.0, -3.2)),)
     elif kind == "ground":
         shape = _laid(sheet(26, 0.0, 1.0)).scaled((11.0, 1.0, 11.0))

@@ -1,0 +1,414 @@
+import hashlib
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import datagen.runs
+from datagen import ManifestError, MeshError, SpecError, generate, parse_spec, verify_dataset
+from datagen.__main__ import main
+from datagen.executors import MAX_TRIES, run_processes, run_serial
+from datagen.manifest import MANIFEST_NAME, read_manifest
+from datagen.writer import TEMPORARY_PREFIX
+
+TINY = {"width": 8, "height": 6, "rays_per_pixel": 1, "frames_per_clip": 2, "seed": 4}
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def spec(count=4, **fields):
+    return parse_spec(TINY | {"count": count} | fields)
+
+
+def sums(folder):
+    """The checksum of everything a run leaves, by relative path."""
+    files = [
+        p for p in sorted(Path(folder).rglob("*")) if p.is_file() and p.suffix in (".exr", ".png", ".jsonl", ".json")
+    ]
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+def run_script(code, *arguments, **options):
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, arguments)], cwd=ROOT, text=True, **options)
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("reference") / "data"
+    generate(spec(), folder)
+    return folder
+
+
+def test_two_workers_make_the_same_bytes_as_one(reference, tmp_path):
+    result = generate(spec(), tmp_path / "two", workers=2)
+    assert result.is_complete
+    assert sums(tmp_path / "two") == sums(reference)
+    assert list(read_manifest(tmp_path / "two")) == [0, 1, 2, 3]
+    lines = (tmp_path / "two" / MANIFEST_NAME).read_text().splitlines()
+    assert [json.loads(line)["index"] for line in lines] == [0, 1, 2, 3]
+    generate(spec(seed=5), tmp_path / "other")
+    mine, other = sums(reference), sums(tmp_path / "other")
+    assert all(mine[name] != other[name] for name in mine if name.endswith(".exr"))
+
+
+def test_a_finished_run_makes_nothing_again(reference, monkeypatch):
+    before = sums(reference)
+    monkeypatch.setattr(datagen.runs, "make_sample", lambda *_: pytest.fail("made a frame again"))
+    result = generate(spec(), reference)
+    assert (result.made, result.kept, result.is_complete) == (0, 4, True)
+    assert sums(reference) == before
+
+
+def test_a_longer_run_extends_a_shorter_one(reference, tmp_path):
+    generate(spec(count=1), tmp_path / "data")
+    result = generate(spec(count=4), tmp_path / "data")
+    assert (result.made, result.kept) == (3, 1)
+    assert sums(tmp_path / "data") == sums(reference)
+
+
+@pytest.mark.parametrize(
+    ("fields", "named"),
+    [
+        ({"seed": 5}, ["seed"]),
+        ({"width": 9, "exposure": 0.25}, ["exposure", "width"]),
+        ({"count": 2}, ["count"]),
+        ({"frames_per_clip": 3, "fps": 30.0, "rays_per_pixel": 2}, ["fps", "frames_per_clip", "rays_per_pixel"]),
+    ],
+)
+def test_another_configuration_is_refused_and_the_field_named(reference, fields, named):
+    before = sums(reference)
+    with pytest.raises(SpecError) as caught:
+        generate(parse_spec(TINY | {"count": 4} | fields), reference)
+    assert sorted(p.split(":")[0] for p in caught.value.problems) == named
+    assert sums(reference) == before
+
+
+def test_lost_and_cut_files_are_made_again(reference, tmp_path):
+    folder = tmp_path / "data"
+    generate(spec(), folder)
+    (folder / "frames/00000001.exr").unlink()
+    path = folder / "sharp/00000002.png"
+    path.write_bytes(path.read_bytes()[:-5])
+    (folder / "blur" / f"{TEMPORARY_PREFIX}99-1-x.png").write_bytes(b"left behind")
+    result = generate(spec(), folder)
+    assert (result.made, result.kept) == (2, 2)
+    assert sums(folder) == sums(reference)
+
+
+def test_a_manifest_cut_anywhere_in_its_last_line_is_survived(reference, tmp_path, monkeypatch):
+    folder = tmp_path / "data"
+    generate(spec(), folder)
+    whole = (folder / MANIFEST_NAME).read_bytes()
+    last = whole.rstrip(b"\n").rfind(b"\n") + 1
+    for length in (last + 1, last + 40, len(whole) - 2, len(whole) - 1, last):
+        (folder / MANIFEST_NAME).write_bytes(whole[:length])
+        assert list(read_manifest(folder)) == [0, 1, 2]
+        assert generate(spec(), folder).made == 1
+        assert sums(folder) == sums(reference)
+
+
+def test_damage_elsewhere_in_the_manifest_is_an_error_and_harms_nothing(tmp_path):
+    folder = tmp_path / "data"
+    generate(spec(count=2), folder)
+    whole = (folder / MANIFEST_NAME).read_bytes()
+    for damaged in (b"{" + whole, whole[5:], whole + b"[]\n", whole + whole.replace(b'"bytes": ', b'"bytes": 1')):
+        (folder / MANIFEST_NAME).write_bytes(damaged)
+        with pytest.raises(ManifestError):
+            generate(spec(count=2), folder)
+        assert (folder / MANIFEST_NAME).read_bytes() == damaged
+        assert len(list((folder / "frames").iterdir())) == 2
+
+
+# One process that forks for every kill point: the k-th fsync or rename kills it before, or after, being done.
+KILL_EVERYWHERE = """
+import os, signal, sys
+import torch
+torch.set_num_threads(1)
+import datagen.runs as runs
+from datagen import generate, parse_spec
+from datagen.samples import make_sample
+import json, pathlib
+base, fields = pathlib.Path(sys.argv[1]), json.loads(sys.argv[2])
+spec = parse_spec(fields)
+made = {}
+def remembered(plan, index):  # rendering is not what is tested here
+    if index not in made:
+        made[index] = make_sample(plan, index)
+    return made[index]
+runs.make_sample = remembered
+generate(spec, base / "whole")
+
+def in_child(k, after, out):
+    pid = os.fork()
+    if pid == 0:
+        left = [k]
+        def deadly(real):
+            def call(*a, **kw):
+                left[0] -= 1
+                if left[0] == 0 and not after:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                result = real(*a, **kw)
+                if left[0] == 0:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return result
+            return call
+        if k:
+            os.fsync, os.replace = deadly(os.fsync), deadly(os.replace)
+        try:
+            generate(spec, out)
+        finally:
+            os._exit(0 if sys.exc_info()[0] is None else 1)
+    return os.waitpid(pid, 0)[1]
+
+k = points = 0
+while True:
+    k += 1
+    killed = 0
+    for after in (False, True):
+        out = base / f"{k}-{after}"
+        status = in_child(k, after, out)
+        if os.WIFSIGNALED(status):
+            killed += 1
+            listed = [json.loads(l) for l in (out / "manifest.jsonl").read_bytes().split(b"\\n")[:-1]] \\
+                if (out / "manifest.jsonl").exists() else []
+            for entry in listed:  # a listed frame is whole, right after the kill
+                for file in entry["files"]:
+                    assert (out / file["path"]).stat().st_size == file["bytes"], (k, after)
+        status = in_child(0, False, out)
+        assert status == 0, (k, after, status)
+    points += killed
+    if not killed:
+        break
+print(points)
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
+def test_killed_at_every_commit_step_a_rerun_gives_the_same_bytes(tmp_path):
+    child = run_script(KILL_EVERYWHERE, tmp_path, json.dumps(TINY | {"count": 2}), stdout=subprocess.PIPE)
+    points = int(child.communicate(timeout=300)[0].splitlines()[-1])
+    assert child.returncode == 0
+    assert points >= 2 * 2 * 10  # three files of three steps and a line, a frame
+    whole = sums(tmp_path / "whole")
+    runs = [p for p in tmp_path.iterdir() if p.name != "whole"]
+    assert len(runs) == points + 2
+    for folder in runs:
+        assert sums(folder) == whole, folder.name
+        assert not list(folder.rglob(f"{TEMPORARY_PREFIX}*")), folder.name
+
+
+DRIVE = """
+import sys
+from datagen.__main__ import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def command(folder, count=6, workers=2):
+    flags = {"out": folder, "count": count, "width": 8, "height": 6, "rays-per-pixel": 1, "frames-per-clip": 2}
+    words = [w for name, value in (flags | {"seed": 4, "workers": workers}).items() for w in (f"--{name}", str(value))]
+    return words
+
+
+def children_of(pid):
+    """The processes whose parent is `pid`, from /proc."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
+def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path):
+    generate(spec(count=6), tmp_path / "whole")
+    folder, rng = tmp_path / "data", random.Random(3)
+    driver = run_script(DRIVE, *command(folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 60
+    while not list((folder / "frames").glob("*.exr")) and time.monotonic() < deadline and driver.poll() is None:
+        time.sleep(0.01)
+    time.sleep(rng.uniform(0, 0.3))
+    workers = children_of(driver.pid)
+    driver.send_signal(signal.SIGKILL)
+    driver.wait(timeout=30)
+    deadline = time.monotonic() + 20
+    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert workers
+    assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+    listed = read_manifest(folder) if (folder / MANIFEST_NAME).exists() else {}
+    assert verify_dataset(folder) == []
+    result = generate(spec(count=6), folder)
+    assert result.kept == len(listed)
+    assert sums(folder) == sums(tmp_path / "whole")
+
+
+def test_an_interrupt_ends_with_130_and_a_rerun_finishes(tmp_path):
+    folder = tmp_path / "data"
+    driver = run_script(DRIVE, *command(folder, count=40, workers=1), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    deadline = time.monotonic() + 60
+    while not list((folder / "frames").glob("*.exr")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    driver.send_signal(signal.SIGINT)
+    _, told = driver.communicate(timeout=60)
+    assert driver.returncode == 130
+    assert "the same command finishes the rest" in told
+    assert verify_dataset(folder) == []
+
+
+def task_that_fails_at_2(plan, folder, index):
+    if index == 2:
+        raise ValueError("two is\nnot possible")
+    return f"{plan}{folder}{index}"
+
+
+def task_that_dies_at_1(plan, folder, index):
+    if index == 1:
+        (Path(folder) / f"try-{os.getpid()}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return str(index)
+
+
+def test_a_frame_that_fails_is_listed_and_the_others_are_made(tmp_path):
+    for outcomes in (
+        list(run_serial(task_that_fails_at_2, "p", "f", range(5))),
+        list(run_processes(task_that_fails_at_2, "p", "f", range(5), 2)),
+    ):
+        outcomes.sort(key=lambda o: o.index)
+        assert [o.index for o in outcomes] == [0, 1, 2, 3, 4]
+        assert [o.error for o in outcomes] == ["", "", "ValueError: two is not possible", "", ""]
+        assert outcomes[3].text == "pf3"
+
+
+def test_a_frame_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_path):
+    outcomes = sorted(run_processes(task_that_dies_at_1, "", str(tmp_path), range(4), 2), key=lambda o: o.index)
+    assert [(o.index, o.text) for o in outcomes] == [(0, "0"), (1, ""), (2, "2"), (3, "3")]
+    assert outcomes[1].error == f"its process died {MAX_TRIES} times"
+    assert len(list(tmp_path.iterdir())) == MAX_TRIES
+    with pytest.raises(ValueError, match="workers: expected"):
+        list(run_processes(task_that_dies_at_1, "", "", range(1), 0))
+
+
+def test_a_failing_frame_gives_exit_code_1_and_is_made_by_a_rerun(tmp_path, monkeypatch, capsys):
+    real = datagen.runs.make_sample
+
+    def faulty(plan, index):
+        if index == 1:
+            raise OSError(28, "No space left on device")
+        return real(plan, index)
+
+    monkeypatch.setattr(datagen.runs, "make_sample", faulty)
+    words = command(tmp_path / "data", count=3, workers=1)
+    assert main(words) == 1
+    assert "failed frame 1: OSError: [Errno 28] No space left on device" in capsys.readouterr().err
+    failures = json.loads((tmp_path / "data/failures.json").read_text())
+    assert [f["index"] for f in failures["frames"]] == [1]
+    assert list(read_manifest(tmp_path / "data")) == [0, 2]
+    monkeypatch.setattr(datagen.runs, "make_sample", real)
+    assert main(words) == 0
+    assert not (tmp_path / "data/failures.json").exists()
+    assert list(read_manifest(tmp_path / "data")) == [0, 1, 2]
+
+
+def test_bad_assets_give_exit_code_1_and_are_listed(tmp_path, capsys):
+    assets = tmp_path / "meshes"
+    assets.mkdir()
+    (assets / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (assets / "bad.ply").write_text("ply\nnothing")
+    words = [*command(tmp_path / "data", count=2, workers=1), "--source", "meshes", "--assets", str(assets)]
+    assert main(words) == 1
+    told = capsys.readouterr()
+    assert "refused bad.ply: expected a readable .ply file" in told.err
+    assert "2 frames made" in told.out
+    assert [f["path"] for f in json.loads((tmp_path / "data/failures.json").read_text())["assets"]] == ["bad.ply"]
+    (assets / "bad.ply").unlink()
+    assert main(words) == 0
+    (assets / "good.obj").write_text("v 0 0 0\nv 2 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    assert main(words) == 2
+    assert "assets_sha256: expected" in capsys.readouterr().err
+
+
+def test_nothing_is_written_when_no_asset_can_be_used(tmp_path, capsys):
+    assets = tmp_path / "meshes"
+    assets.mkdir()
+    (assets / "bad.obj").write_text("v 0 0 0\n")
+    words = ["--out", str(tmp_path / "data"), "--source", "meshes", "--assets", str(assets)]
+    assert main(words) == 2
+    assert "bad.obj: expected triangles, got none" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(MeshError):
+        generate(parse_spec({"source": "meshes", "assets": str(assets)}), tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--width", "0"], "width: expected"),
+        (["--exposure", "2"], "exposure: expected"),
+        (["--source", "meshes"], "assets: expected"),
+        (["--config", "nowhere.toml"], "config: expected"),
+        (["--workers", "-1"], "workers: expected"),
+        (["--colour", "red"], "colour"),
+        (["--count", "many"], "count"),
+        (["--source", "video"], "source"),
+    ],
+)
+def test_wrong_usage_gives_exit_code_2_and_writes_nothing(tmp_path, capsys, words, named):
+    assert main(["--out", str(tmp_path / "data"), *words]) == 2
+    told = capsys.readouterr()
+    assert named in told.err + told.out
+    assert not (tmp_path / "data").exists()
+
+
+def test_options_win_over_the_configuration_file(tmp_path, capsys):
+    config = tmp_path / "run.toml"
+    config.write_text('width = 8\nheight = 6\ncount = 1\nrays_per_pixel = 1\nseed = 9\nsource = "primitives"\n')
+    assert main(["--out", str(tmp_path / "data"), "--config", str(config), "--seed", "3"]) == 0
+    record = json.loads((tmp_path / "data/run.json").read_text())["spec"]
+    assert (record["width"], record["seed"], record["count"]) == (8, 3, 1)
+    config.write_text("width = 8\nheigth = 6\nexposure = 3.0\n")
+    assert main(["--out", str(tmp_path / "other"), f"--config={config}"]) == 2
+    told = capsys.readouterr().err
+    assert "heigth: expected one of the fields" in told
+    assert "exposure: expected" in told
+
+
+def test_two_runs_in_one_folder_are_not_let_in(tmp_path):
+    pytest.importorskip("fcntl", reason="needs the system's file locks")
+    from datagen.manifest import locked_folder
+
+    with locked_folder(tmp_path / "data"), pytest.raises(SpecError, match="no other run"):
+        generate(spec(), tmp_path / "data")
+    assert generate(spec(count=1), tmp_path / "data").made == 1
+
+
+def test_a_path_that_is_a_file_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(SpecError, match="out: expected a folder"):
+        generate(spec(), tmp_path / "file")
+
+
+def test_a_sequence_is_played(tmp_path):
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    start = rng.normal(size=(1, 12, 3))
+    vertices = start + np.cumsum(rng.normal(size=(6, 12, 3)) * 0.1, 0)
+    np.savez(tmp_path / "walk.npz", vertices=vertices, faces=rng.integers(0, 12, (9, 3)))
+    out = tmp_path / "data"
+    words = [*command(out, count=2, workers=1), "--source", "sequence", "--assets", str(tmp_path / "walk.npz")]
+    assert main(words) == 0
+    from datagen import BlurDataset
+
+    meta = BlurDataset(out).metadata(1)
+    assert meta["scene"]["sequence"]["frames"] == 6
+    assert meta["meshes"][-1]["segments"] >= 1

@@ -58,7 +58,7 @@ def as_tensor(name: str, value: Any) -> Tensor:
     if isinstance(value, np.ndarray):
         if value.dtype.kind not in "fiu" or not value.dtype.isnative:
             raise fail_type(name, "a numeric array in native byte order", value)
-        return torch.as_tensor(np.ascontiguousarray(value))
+        return torch.as_tensor(np.array(value, order="C"))  # a copy: arrays may be read-only or change later
     try:
         return torch.as_tensor(np.asarray(value, dtype=np.float64))
     except (TypeError, ValueError):

@@ -10,6 +10,7 @@ rule: ours.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -121,9 +122,9 @@ def inside_sign(corners: Corners, planes: list[Tensor], u_start: Tensor, u_end: 
     """Return the common sign of the e_i (m,) int8 over pieces of time in which none of them changes sign: +1 or -1
     inside, 0 outside or beyond a clip plane.
 
-    The signs are taken at the piece's midpoint; where one is 0 there, at a second point, for the function may only
-    touch zero. An edge that is 0 there too lies on the ray throughout and counts as if the ray were moved by
-    (eps, eps^2): of the faces around an edge or a vertex exactly one then covers the ray.
+    The sign taken is that of the mean over the piece: unlike the value at one point it cannot vanish for a function
+    that merely touches zero. An edge whose mean is 0 lies on the ray throughout and counts as if the ray were moved
+    by (eps, eps^2): of the faces around an edge or a vertex exactly one then covers the ray.
 
     Args:
         corners: m pairs.
@@ -132,29 +133,27 @@ def inside_sign(corners: Corners, planes: list[Tensor], u_start: Tensor, u_end: 
 
     Source: ours.
     """
-    e, n, _ = _signs_at(corners, planes, 0.5 * (u_start + u_end))
-    zero = ((e == 0).any(0) | (n == 0).any(0)).nonzero().flatten()
+    middle, length = 0.5 * (u_start + u_end), u_end - u_start
+    x, y, w = corners.at(middle)
+    dx, dy = ((c[1] - c[0]) * length for c in (corners.x, corners.y))
+    e = edges_of(x, y) + edges_of(dx, dy) / 12  # the mean of a quadratic: its middle plus its bend / 12
+    zero = (e == 0).any(0).nonzero().flatten()
     if len(zero):
-        second = 0.75 * u_start[zero] + 0.25 * u_end[zero]
-        e_again, n_again, tie = _signs_at(corners[zero], [p[..., zero] for p in planes], second)
-        e_zero, n_zero = e[:, zero], n[:, zero]
-        e_again = torch.where(e_again != 0, e_again, tie)
-        e[:, zero] = torch.where(e_zero != 0, e_zero, e_again)
-        n[:, zero] = torch.where(n_zero != 0, n_zero, n_again)
+        e[:, zero] = _break_ties(e[:, zero], x[:, zero], y[:, zero], w[:, zero])
     sign = (e > 0).all(0).to(torch.int8) - (e < 0).all(0).to(torch.int8)
-    return sign * (n * sign >= 0).all(0)
+    for plane in planes:
+        mean = e.new_zeros(len(u_start))
+        for side in (-0.5, 0.5):  # Gauss: two points give the mean of a cubic exactly
+            u = middle + side * length / math.sqrt(3)
+            x, y, _ = corners.at(u)
+            mean = mean + (edges_of(x, y) * ((1 - u) * plane[0] + u * plane[1])).sum(0)
+        sign = sign * (mean * sign >= 0)
+    return sign
 
 
-def _signs_at(corners: Corners, planes: list[Tensor], u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return, at local times `u`, the e_i (3, m), the clip planes' N (planes, m), and the slopes that break ties."""
-    x, y, w = corners.at(u)
-    e = edges_of(x, y)
-    n = e.new_zeros(len(planes), len(u))
-    for k, plane in enumerate(planes):
-        n[k] = (e * ((1 - u) * plane[0] + u * plane[1])).sum(0)
-    if planes or (e == 0).any():
-        i, j = list(FIRST), list(SECOND)
-        sign = torch.tensor(EDGE_SIGN, dtype=e.dtype, device=e.device).unsqueeze(1)
-        slope_x, slope_y = sign * cross(y[i], w[i], y[j], w[j]), sign * cross(w[i], x[i], w[j], x[j])
-        return e, n, torch.where(slope_x != 0, slope_x, slope_y)
-    return e, n, e
+def _break_ties(e: Tensor, x: Tensor, y: Tensor, w: Tensor) -> Tensor:
+    """Return `e` (3, m) with each zero replaced by the first of its slopes along the ray's x and y that is not."""
+    i, j = list(FIRST), list(SECOND)
+    sign = torch.tensor(EDGE_SIGN, dtype=e.dtype, device=e.device).unsqueeze(1)
+    slope_x, slope_y = sign * cross(y[i], w[i], y[j], w[j]), sign * cross(w[i], x[i], w[j], x[j])
+    return torch.where(e != 0, e, torch.where(slope_x != 0, slope_x, slope_y))

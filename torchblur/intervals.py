@@ -4,7 +4,7 @@ Before: prisms.py, edges.py.  After: cells.py.
 Symbols: P prisms, n pairs of prism and pixel, N intervals; t shutter time; u local time of a prism, 0 at its open end.
 Nearness = M / D orders surfaces along the ray, larger in front: 1 / w under perspective, 2 - z / w otherwise; M and D
 are cubics in time, kept by their Bernstein coefficients over the interval.
-Source: Ronnow et al. 2021, sec. 4 (intervals), 2022, eq. 1-3 (depth); signs at midpoints instead of paired hits,
+Source: Ronnow et al. 2021, sec. 4 (intervals), 2022, eq. 1-3 (depth); signs over pieces of time instead of paired hits,
 clip planes as cubics, tie rule: ours.
 """
 
@@ -110,7 +110,7 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
     Accuracy: times to about 1e-12 in float64 away from tangencies, where an error e in the discriminant changes the
         covered time by 2 sqrt(e) / |c2|. Neighbours that share an edge share its times bit for bit.
     Gradient: to the vertices and the camera through t_start and t_end (implicit function theorem).
-    Source: Ronnow et al. 2021, sec. 4.1, repaired: coverage by signs at midpoints.
+    Source: Ronnow et al. 2021, sec. 4.1, repaired: coverage by signs, not by pairing hits.
     """
     with torch.no_grad():
         low_x, low_y, n_x, n_y = block.columns_rows(prisms.bounds_px[:, candidates])
@@ -189,7 +189,7 @@ def _may_cover(prisms: Prisms, prism: Tensor, corners: Corners) -> Tensor:
 def _covered_pieces(prisms: Prisms, prism: Tensor, corners: Corners) -> tuple[Tensor, ...]:
     """Return pair, u_start, u_end, kind_start, kind_end (N,) of the covered slices of m pairs, in pair and time order.
 
-    The roots cut time into pieces; a piece is covered where its midpoint is inside, on the visible side, and between
+    The roots cut time into pieces; a piece is covered where the ray is inside in it, on the visible side, and between
     the clip planes. Neighbouring pieces that face the same way become one.
     """
     w = corners.w

@@ -135,7 +135,7 @@ class Scene:
     background: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if isinstance(self.meshes, Mesh) or not all(isinstance(m, Mesh) for m in self.meshes):
+        if not isinstance(self.meshes, Sequence) or not all(isinstance(m, Mesh) for m in self.meshes):
             raise check.fail_type("meshes", "a sequence of Mesh", self.meshes)
         if not isinstance(self.camera, Camera):
             raise check.fail_type("camera", "a Camera", self.camera)

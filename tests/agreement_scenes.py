@@ -6,7 +6,7 @@ import numpy as np
 import scene_makers as make
 from oracles import PlainMesh, PlainScene
 
-SIZE = 12  # pixels a side
+SIZE = 10  # pixels a side
 BACKGROUND = (0.2, 0.4, 0.6)
 TILT = make.rotation_y(0.6) @ make.rotation_z(0.4)
 
@@ -36,7 +36,7 @@ def crossing() -> PlainScene:
     generator = np.random.default_rng(8)
     meshes = []
     for opacity in (1.0, 0.5, 0.7, 0.4):
-        plane = make.quad(-1.3, 1.2, -1.1, 1.4, 0, 1, color=generator.uniform(0, 1, 3), opacity=opacity)
+        plane = make.quad(-1.33, 1.21, -1.12, 1.44, 0, 1, color=generator.uniform(0, 1, 3), opacity=opacity)
         plane.vertices[..., 2] = generator.uniform(-0.9, 0.9, (2, 4))
         meshes.append(plane)
     return PlainScene(meshes, make.IDENTITY, SIZE, SIZE, BACKGROUND)
@@ -56,9 +56,9 @@ def near_plane() -> PlainScene:
 def slivers() -> PlainScene:
     """Long thin triangles, much thinner than a pixel."""
     generator = np.random.default_rng(4)
-    n = 24
+    n = 36
     a, b = generator.uniform(-1.5, 1.5, (2, n, 3))
-    vertices = np.stack([a, b, b + generator.uniform(-0.02, 0.02, (n, 3))], 1)
+    vertices = np.stack([a, b, b + generator.uniform(-0.05, 0.05, (n, 3))], 1)
     vertices[..., 2] = generator.uniform(-0.8, 0.8, (n, 1)) + generator.uniform(-0.05, 0.05, (n, 3))
     knots = np.stack([vertices, vertices + generator.uniform(-0.6, 0.6, (n, 1, 3)) * np.array([1, 1, 0])])
     mesh = PlainMesh(knots.reshape(2, -1, 3), np.arange(3 * n).reshape(n, 3), generator.uniform(0, 1, (n, 3)), 0.8)

@@ -46,7 +46,7 @@ def to_torch(scene: PlainScene, dtype=torch.float64, device="cpu") -> tb.Scene:
     meshes = [
         tb.Mesh(
             tensor(m.vertices),
-            torch.as_tensor(m.faces, device=device),
+            torch.tensor(m.faces.copy(), device=device),
             tb.Material(color=tensor(m.color), opacity=tensor(m.opacity), double_sided=m.double_sided),
         )
         for m in scene.meshes

@@ -18,7 +18,7 @@ from agreement_scenes import SCENES
 
 import torchblur as tb
 
-COUNTS = (64, 256, 1024)
+COUNTS = (64, 256, 1024, 4096)
 ATOL = 1e-9  # the stated exactness in float64
 
 
@@ -62,16 +62,8 @@ def test_gap_to_accumulation_falls_as_one_over_n(name):
         assert (gap.max(-1) <= 2 / n * n_events + 1e-12).all(), f"N = {n}"
         means.append(gap.mean())
     slope = np.polyfit(np.log(COUNTS), np.log(means), 1)[0]
-    # -1 in the mean; some thousand events of random phase make it uncertain by a few hundredths
+    # -1 in the mean; some hundred events of random phase make it uncertain by a few hundredths over six doublings
     assert slope <= -0.9, (slope, means)
-
-
-@pytest.mark.parametrize("name", ["crossing", "near plane", "rotating, K = 8"])
-def test_gap_at_4096_instants(name):
-    scene = make.to_torch(SCENES[name]())
-    _, _, n_events = exact(name)
-    gap = np.abs(tb.accumulate(scene, times=4096).rgba.numpy() - tb.render(scene).rgba.numpy())
-    assert (gap.max(-1) <= 2 / 4096 * n_events + 1e-12).all()
 
 
 def test_accumulation_is_the_mean_of_midpoint_instants():
@@ -94,7 +86,7 @@ def test_random_pixels_of_random_scenes(seed):
     )
     window = [(0.0, 1.0), (0.2, 0.7)][seed % 2]
     frame = make.render(scene, t_open=window[0], t_close=window[1])
-    for _ in range(40):
+    for _ in range(30):
         row, col = int(generator.integers(scene.height)), int(generator.integers(scene.width))
         answer = oracles.integrate_pixel(scene, row, col, *window)
         np.testing.assert_allclose(

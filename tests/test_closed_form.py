@@ -145,6 +145,20 @@ def test_04_edge_touches_at_half_time(scale, sign, expected, dtype):
     assert coverage(make.triangle(*at), dtype) == pytest.approx(expected, abs=bound if exact else 5e-4)
 
 
+@pytest.mark.parametrize(("sign", "expected"), [(1.0, 1.0), (-1.0, 0.0)])
+def test_04_touch_in_any_direction(sign, expected):
+    """Turned and scaled, the edge function at the touch is rounding of either sign, and must decide nothing."""
+    generator = np.random.default_rng(1)
+    n = 60
+    meshes = []
+    for _ in range(n):
+        turn, scale = make.rotation_z(generator.uniform(0, 2 * np.pi)), generator.uniform(0.3, 3)
+        at = [np.array([(0, 3.0, 0), (-1 + s / 2, -sign * s, 0), (1 + s / 2, sign * s, 0)]) for s in (-0.5, 0.5)]
+        meshes.append(make.triangle(*(scale * a @ turn.T for a in at), opacity=0.5))
+    got = make.render(one_pixel(meshes)).coverage[0, 0].numpy()
+    np.testing.assert_allclose(got, np.full(n, expected), rtol=0, atol=1e-7)  # sqrt(eps), as the table allows
+
+
 @pytest.mark.parametrize("spacing_px", [0.5, 1.0, 2.0])
 @pytest.mark.parametrize("moving", ["static", "slides along x", "slides along y"])
 def test_05_quads_with_every_pixel_centre_on_edges_and_vertices(spacing_px, moving, dtype):

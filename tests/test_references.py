@@ -1,0 +1,55 @@
+"""Images of an independent path tracer, 4,096 to 8,192 samples a pixel, that lie beside the repository.
+
+Rule of the references' README: the RMSE of our linear RGB lies within 1.25 times the larger of the reference's own
+noise and the distance between the reference and a float64 brute force of 8,192 sub-frames.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import torchblur as tb
+
+FOLDER = Path(__file__).resolve().parents[2] / "shared" / "references"
+NEEDS = {"plank": "textures", "shadow_floor": "lights and shadows"}
+
+
+def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
+    """Return the scene of a folder, one mesh, and the reference image (H, W, 3)."""
+    exr = pytest.importorskip("OpenEXR")
+    with np.load(folder / "scene.npz", allow_pickle=False) as z:
+        s = {k: z[k] for k in z.files}
+    vertices = torch.as_tensor(np.stack([s["verts0"], s["verts1"]])).to(dtype)
+    material = tb.Material(torch.as_tensor(s["face_color"]), torch.as_tensor(s["face_opacity"]))
+    mesh = tb.Mesh(vertices, torch.as_tensor(s["faces"]), material)
+    camera = tb.Camera(torch.as_tensor(s["world_to_clip"]), int(s["width"]), int(s["height"]))
+    scene = tb.Scene([mesh], camera, torch.as_tensor(s["background"]))
+    with exr.File(str(folder / "ref.exr")) as file:
+        channels = file.parts[0].channels
+        if "RGB" in channels:
+            image = channels["RGB"].pixels
+        else:
+            image = np.stack([channels[c].pixels for c in "RGB"], -1)
+        image = np.array(image, dtype=np.float64)
+    return scene, image
+
+
+@pytest.mark.parametrize("name", ["quad", "tris200", "plank", "shadow_floor"])
+def test_matches_the_path_tracer_within_its_noise(name, dtype):
+    if name in NEEDS:
+        pytest.skip(f"{name}: this scene needs {NEEDS[name]}, which torchblur does not have yet")
+    if not (FOLDER / name).is_dir():
+        pytest.skip(f"NOT TESTED: reference images are not at {FOLDER}")
+    scene, image = read_scene(FOLDER / name, dtype)
+    meta = json.loads((FOLDER / name / "meta.json").read_text())
+    got = tb.render(scene).rgba[..., :3].double().numpy()
+    assert got.shape == image.shape
+    rmse = float(np.sqrt(np.mean((got - image) ** 2)))
+    assert rmse <= 1.25 * max(meta["est_rmse_ref"], meta["rmse_brute_force_8192"])
+    sharp = tb.render_instant(scene, t=0.5).rgba[..., :3].double().numpy()
+    assert np.sqrt(np.mean((sharp - image) ** 2)) > 100 * rmse, "a sharp image would pass: the comparison is blind"

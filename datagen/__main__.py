@@ -87,11 +87,15 @@ def _run(spec: Any, arguments: Arguments) -> int:
     from datagen.assets import MeshError
     from datagen.manifest import ManifestError
     from datagen.runs import generate
+    from datagen.writer import FrameFileError
 
     try:
         result = generate(spec, arguments.out, arguments.workers, is_quiet=False)
     except (SpecError, MeshError, ManifestError) as error:
         return _usage(str(error).splitlines())
+    except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_FAILURES
     except KeyboardInterrupt:
         print("interrupted; the same command finishes the rest", file=sys.stderr)
         return EXIT_INTERRUPTED

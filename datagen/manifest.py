@@ -25,6 +25,7 @@ try:
 except ImportError:  # Windows has no such locks; two runs in one folder are then the user's to avoid
     fcntl = None  # type: ignore[assignment]
 
+TEMPORARY_PATTERN = f"{TEMPORARY_PREFIX}[0-9]*-[0-9]*-*"
 RUN_NAME, MANIFEST_NAME, LOCK_NAME = "run.json", "manifest.jsonl", ".lock"
 
 
@@ -80,12 +81,15 @@ def begin_run(folder: Path, plan: Plan) -> dict[int, dict[str, Any]]:
         problems = _differences(_read_run(place), wanted, folder)
         if problems:
             raise SpecError(problems)
-    elif (folder / MANIFEST_NAME).exists():
-        raise SpecError([f"out: expected {RUN_NAME} beside {MANIFEST_NAME} in {str(folder)!r}, got none"])
+    else:
+        strange = sorted(p.name for p in folder.iterdir() if not _is_left_by_a_start(p))
+        if strange:  # people's own files are not to be mixed with, still less swept
+            found = ", ".join(strange[:3]) + (", …" if len(strange) > 3 else "")
+            raise SpecError([f"out: expected an empty folder or a data set with its {RUN_NAME}, got {found}"])
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     for holder in (folder, *(folder / name for name in FOLDERS)):
-        for stale in holder.glob(f"{TEMPORARY_PREFIX}*"):
+        for stale in holder.glob(TEMPORARY_PATTERN):
             stale.unlink(missing_ok=True)
     entries = read_manifest(folder) if (folder / MANIFEST_NAME).exists() else {}
     entries = {i: e for i, e in entries.items() if _files_are_there(folder, e)}
@@ -154,6 +158,13 @@ def verify_dataset(folder: str | Path) -> list[str]:
             if found != file["sha256"]:
                 problems.append(f"{path}: expected sha256 {file['sha256']}, got {found}")
     return problems
+
+
+def _is_left_by_a_start(path: Path) -> bool:
+    """Tell whether a run that was killed before its run.json was there can have left this."""
+    if path.name in FOLDERS:
+        return path.is_dir() and not any(path.iterdir())
+    return path.name == LOCK_NAME or path.match(TEMPORARY_PATTERN)
 
 
 def _line(entry: dict[str, Any]) -> bytes:

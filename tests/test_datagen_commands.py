@@ -1,0 +1,149 @@
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from test_datagen_runs import command
+
+import datagen.runs
+from datagen import MeshError, generate, parse_spec
+from datagen.__main__ import main
+from datagen.executors import MAX_TRIES, run_processes, run_serial
+from datagen.manifest import read_manifest
+
+
+def task_that_fails_at_2(plan, folder, index):
+    if index == 2:
+        raise ValueError("two is\nnot possible")
+    return f"{plan}{folder}{index}"
+
+
+def task_that_dies_at_1(plan, folder, index):
+    if index == 1:
+        (Path(folder) / f"try-{os.getpid()}").touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return str(index)
+
+
+def test_a_frame_that_fails_is_listed_and_the_others_are_made(tmp_path):
+    for outcomes in (
+        list(run_serial(task_that_fails_at_2, "p", "f", range(5))),
+        list(run_processes(task_that_fails_at_2, "p", "f", range(5), 2)),
+    ):
+        outcomes.sort(key=lambda o: o.index)
+        assert [o.index for o in outcomes] == [0, 1, 2, 3, 4]
+        assert [o.error for o in outcomes] == ["", "", "ValueError: two is not possible", "", ""]
+        assert outcomes[3].text == "pf3"
+
+
+def test_a_frame_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_path):
+    outcomes = sorted(run_processes(task_that_dies_at_1, "", str(tmp_path), range(4), 2), key=lambda o: o.index)
+    assert [(o.index, o.text) for o in outcomes] == [(0, "0"), (1, ""), (2, "2"), (3, "3")]
+    assert outcomes[1].error == f"its process died {MAX_TRIES} times"
+    assert len(list(tmp_path.iterdir())) == MAX_TRIES
+    with pytest.raises(ValueError, match="workers: expected"):
+        list(run_processes(task_that_dies_at_1, "", "", range(1), 0))
+
+
+def test_a_failing_frame_gives_exit_code_1_and_is_made_by_a_rerun(tmp_path, monkeypatch, capsys):
+    real = datagen.runs.make_sample
+
+    def faulty(plan, index):
+        if index == 1:
+            raise OSError(28, "No space left on device")
+        return real(plan, index)
+
+    monkeypatch.setattr(datagen.runs, "make_sample", faulty)
+    words = command(tmp_path / "data", count=3, workers=1)
+    assert main(words) == 1
+    assert "failed frame 1: OSError: [Errno 28] No space left on device" in capsys.readouterr().err
+    failures = json.loads((tmp_path / "data/failures.json").read_text())
+    assert [f["index"] for f in failures["frames"]] == [1]
+    assert list(read_manifest(tmp_path / "data")) == [0, 2]
+    monkeypatch.setattr(datagen.runs, "make_sample", real)
+    assert main(words) == 0
+    assert not (tmp_path / "data/failures.json").exists()
+    assert list(read_manifest(tmp_path / "data")) == [0, 1, 2]
+
+
+def test_bad_assets_give_exit_code_1_and_are_listed(tmp_path, capsys):
+    assets = tmp_path / "meshes"
+    assets.mkdir()
+    (assets / "good.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    (assets / "bad.ply").write_text("ply\nnothing")
+    words = [*command(tmp_path / "data", count=2, workers=1), "--source", "meshes", "--assets", str(assets)]
+    assert main(words) == 1
+    told = capsys.readouterr()
+    assert "refused bad.ply: expected a readable .ply file" in told.err
+    assert "2 frames made" in told.out
+    assert [f["path"] for f in json.loads((tmp_path / "data/failures.json").read_text())["assets"]] == ["bad.ply"]
+    (assets / "bad.ply").unlink()
+    assert main(words) == 0
+    (assets / "good.obj").write_text("v 0 0 0\nv 2 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
+    assert main(words) == 2
+    assert "assets_sha256: expected" in capsys.readouterr().err
+
+
+def test_nothing_is_written_when_no_asset_can_be_used(tmp_path, capsys):
+    assets = tmp_path / "meshes"
+    assets.mkdir()
+    (assets / "bad.obj").write_text("v 0 0 0\n")
+    words = ["--out", str(tmp_path / "data"), "--source", "meshes", "--assets", str(assets)]
+    assert main(words) == 2
+    assert "bad.obj: expected triangles, got none" in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+    with pytest.raises(MeshError):
+        generate(parse_spec({"source": "meshes", "assets": str(assets)}), tmp_path / "data")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (["--width", "0"], "width: expected"),
+        (["--exposure", "2"], "exposure: expected"),
+        (["--source", "meshes"], "assets: expected"),
+        (["--config", "nowhere.toml"], "config: expected"),
+        (["--workers", "-1"], "workers: expected"),
+        (["--colour", "red"], "colour"),
+        (["--count", "many"], "count"),
+        (["--source", "video"], "source"),
+    ],
+)
+def test_wrong_usage_gives_exit_code_2_and_writes_nothing(tmp_path, capsys, words, named):
+    assert main(["--out", str(tmp_path / "data"), *words]) == 2
+    told = capsys.readouterr()
+    assert named in told.err + told.out
+    assert not (tmp_path / "data").exists()
+
+
+def test_options_win_over_the_configuration_file(tmp_path, capsys):
+    config = tmp_path / "run.toml"
+    config.write_text(
+        'fps = 30\nwidth = 8\nheight = 6\ncount = 1\nrays_per_pixel = 1\nseed = 9\nsource = "primitives"\n'
+    )
+    assert main(["--out", str(tmp_path / "data"), "--config", str(config), "--seed", "3"]) == 0
+    record = json.loads((tmp_path / "data/run.json").read_text())["spec"]
+    assert (record["width"], record["seed"], record["count"]) == (8, 3, 1)
+    config.write_text("width = 8\nheigth = 6\nexposure = 3.0\n")
+    assert main(["--out", str(tmp_path / "other"), f"--config={config}"]) == 2
+    told = capsys.readouterr().err
+    assert "heigth: expected one of the fields" in told
+    assert "exposure: expected" in told
+
+
+def test_a_sequence_is_played(tmp_path):
+    import numpy as np
+
+    rng = np.random.default_rng(0)
+    start = rng.normal(size=(1, 12, 3))
+    vertices = start + np.cumsum(rng.normal(size=(6, 12, 3)) * 0.1, 0)
+    np.savez(tmp_path / "walk.npz", vertices=vertices, faces=rng.integers(0, 12, (9, 3)))
+    out = tmp_path / "data"
+    words = [*command(out, count=2, workers=1), "--source", "sequence", "--assets", str(tmp_path / "walk.npz")]
+    assert main(words) == 0
+    from datagen import BlurDataset
+
+    meta = BlurDataset(out).metadata(1)
+    assert meta["scene"]["sequence"]["frames"] == 6
+    assert meta["meshes"][-1]["segments"] >= 1

@@ -66,10 +66,10 @@ def slivers() -> PlainScene:
 
 
 def many_layers() -> PlainScene:
-    """Sixteen translucent sheets sliding at different speeds."""
+    """Eleven translucent sheets sliding at different speeds."""
     generator = np.random.default_rng(6)
     meshes = []
-    for z in np.linspace(-0.9, 0.9, 16):
+    for z in np.linspace(-0.9, 0.9, 11):
         x, y = generator.uniform(-1.5, 0, 2)
         shift = generator.uniform(-0.8, 0.8, 2)
         meshes.append(

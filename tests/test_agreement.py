@@ -72,6 +72,17 @@ def test_accumulation_is_the_mean_of_midpoint_instants():
     torch.testing.assert_close(tb.accumulate(scene, times=5).rgba, mean, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("name", ["opaque", "moving camera", "four segments"])
+def test_accumulation_follows_the_window_and_the_rays(name):
+    scene, n = make.to_torch(SCENES[name]()), 256
+    options = {"shutter": tb.Shutter.box(0.3, 0.85), "rays_per_pixel": 3}
+    gap = np.abs(tb.accumulate(scene, times=n, **options).rgba.numpy() - tb.render(scene, **options).rgba.numpy())
+    # three rays, each with the events of a neighbourhood of its pixel: at most three times the most of any pixel
+    assert gap.max() <= 2 / n * 3 * exact(name)[2].max()
+    assert gap.mean() < 1 / (2 * n)  # an event of contrast 1 moves the mean by at most as much; most are smaller
+    assert np.abs(tb.render(scene).rgba.numpy() - tb.render(scene, **options).rgba.numpy()).max() > 0.05
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_random_pixels_of_random_scenes(seed):
     generator = np.random.default_rng(100 + seed)

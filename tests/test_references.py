@@ -45,6 +45,8 @@ def test_matches_the_path_tracer_within_its_noise(name, dtype):
         pytest.skip(f"{name}: this scene needs {NEEDS[name]}, which torchblur does not have yet")
     if not (FOLDER / name).is_dir():
         pytest.skip(f"NOT TESTED: reference images are not at {FOLDER}")
+    if name == "tris200" and dtype == torch.float64:
+        pytest.skip("tris200 takes 20 s; float32, the coarser type, is the one that runs")
     scene, image = read_scene(FOLDER / name, dtype)
     meta = json.loads((FOLDER / name / "meta.json").read_text())
     got = tb.render(scene).rgba[..., :3].double().numpy()

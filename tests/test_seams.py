@@ -100,3 +100,32 @@ def test_float32_vertices_shared_by_position_only():
     for dtype in (torch.float32, torch.float64):
         alpha = make.render(scene, dtype).rgba[..., 3]
         torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5), rtol=0, atol=ATOL[dtype])
+
+
+def coincident_knots(kind: str, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return knots, faces and matrix of a sheet that fills the view, with all numbers on a dyadic grid.
+
+    Pixel centres of an 8 by 8 image are dyadic too: vertices and edges pass exactly through them, or lie on them.
+    """
+    vertices, faces = make.grid(12, 3.0)
+    if kind == "every vertex on a grid":
+        return vertices + generator.integers(-2, 3, (3, *vertices.shape)) / 16, faces, make.IDENTITY
+    if kind == "edges slide along the rays":
+        shear = np.eye(3)
+        shear[0, 1] = generator.integers(-2, 3) / 4
+        shift = np.array([*generator.integers(-2, 3, 2), 0]) / 4
+        return np.stack([vertices, vertices @ shear.T + shift]), faces, make.IDENTITY
+    start = vertices * np.array([6, 6, 1]) + np.array(
+        [0, 0, 2]
+    )  # comes and goes along the axis: vertices move on rays through the centre
+    return np.stack([start, start + np.array([0, 0, generator.integers(1, 9) / 4])]), faces, make.w_is_z(0.25, 64)
+
+
+@pytest.mark.parametrize("kind", ["every vertex on a grid", "edges slide along the rays", "towards the camera"])
+@pytest.mark.parametrize("seed", range(4))
+def test_coincidences_on_a_dyadic_grid(kind, seed, dtype):
+    generator = np.random.default_rng(seed)
+    knots, faces, matrix = coincident_knots(kind, generator)
+    mesh = PlainMesh(knots, generator.permutation(faces), opacity=0.5)
+    alpha = make.render(PlainScene([mesh], matrix, 8, 8), dtype).rgba[..., 3]
+    torch.testing.assert_close(alpha, torch.full_like(alpha, 0.5), rtol=0, atol=ATOL[dtype])

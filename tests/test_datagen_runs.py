@@ -63,6 +63,24 @@ def test_a_finished_run_makes_nothing_again(reference, monkeypatch):
     assert sums(reference) == before
 
 
+def test_frames_finished_before_an_interrupt_are_listed_and_kept(reference, tmp_path, monkeypatch):
+    real = datagen.runs.make_sample
+
+    def stopped(plan, index):
+        if index == 2:
+            raise KeyboardInterrupt
+        return real(plan, index)
+
+    monkeypatch.setattr(datagen.runs, "make_sample", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        generate(spec(), tmp_path / "data")
+    assert list(read_manifest(tmp_path / "data")) == [0, 1]
+    monkeypatch.setattr(datagen.runs, "make_sample", real)
+    result = generate(spec(), tmp_path / "data")
+    assert (result.made, result.kept) == (2, 2)
+    assert sums(tmp_path / "data") == sums(reference)
+
+
 def test_a_longer_run_extends_a_shorter_one(reference, tmp_path):
     generate(spec(count=1), tmp_path / "data")
     result = generate(spec(count=4), tmp_path / "data")

@@ -139,18 +139,18 @@ def plant_background_not_weighted(patch):
 
 
 def plant_segment_times_wrong(patch):
-    original = prisms.knot_times
+    original = prisms.window_times
 
     def wrong(*args):
         times = original(*args)
         return [times[0], *(t**2 for t in times[1:-1]), times[-1]]
 
-    patch.setattr(prisms, "knot_times", wrong)
+    patch.setattr(prisms, "window_times", wrong)
 
 
 def plant_camera_knots_ignored(patch):
-    original = prisms.knot_times
-    patch.setattr(prisms, "knot_times", lambda *args: original(*args)[:: len(original(*args)) - 1])
+    original = prisms.window_times
+    patch.setattr(prisms, "window_times", lambda *args: original(*args)[:: len(original(*args)) - 1])
 
 
 def plant_middle_coefficient_wrong(patch):

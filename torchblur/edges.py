@@ -10,6 +10,7 @@ rule: ours.
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -118,42 +119,76 @@ def plane_roots(edge: Tensor, plane: Tensor) -> Tensor:
     return table
 
 
-def inside_sign(corners: Corners, planes: list[Tensor], u_start: Tensor, u_end: Tensor) -> Tensor:
-    """Return the common sign of the e_i (m,) int8 over pieces of time in which none of them changes sign: +1 or -1
-    inside, 0 outside or beyond a clip plane.
+def edge_signs(corners: Corners, roots: Tensor) -> Tensor:
+    """Return the sign of each e_i before, between and after its own two roots, (3 slices, 3 edges, m) int8.
 
-    The sign taken is that of the mean over the piece: unlike the value at one point it cannot vanish for a function
-    that merely touches zero. An edge whose mean is 0 lies on the ray throughout and counts as if the ray were moved
-    by (eps, eps^2): of the faces around an edge or a vertex exactly one then covers the ray.
+    The sign is that of the mean over the slice: unlike the value at one point it cannot vanish for an edge that
+    merely touches the ray. It depends on the edge alone, so that both faces at an edge take opposite signs, whatever
+    rounding makes of an edge that slides along itself. An edge whose mean is exactly 0 lies on the ray throughout and
+    counts as if the ray were moved by (eps, eps^2): of the faces around it exactly one then covers the ray.
 
     Args:
         corners: m pairs.
-        planes: (2, 3, m) values of the clip planes at the corners.
-        u_start, u_end: (m,) the piece, in local time.
+        roots: (6, m) of `edge_roots`.
 
     Source: ours.
     """
-    middle, length = 0.5 * (u_start + u_end), u_end - u_start
-    x, y, w = corners.at(middle)
-    dx, dy = ((c[1] - c[0]) * length for c in (corners.x, corners.y))
-    e = edges_of(x, y) + edges_of(dx, dy) / 12  # the mean of a quadratic: its middle plus its bend / 12
-    zero = (e == 0).any(0).nonzero().flatten()
-    if len(zero):
-        e[:, zero] = _break_ties(e[:, zero], x[:, zero], y[:, zero], w[:, zero])
-    sign = (e > 0).all(0).to(torch.int8) - (e < 0).all(0).to(torch.int8)
-    for plane in planes:
-        mean = e.new_zeros(len(u_start))
-        for side in (-0.5, 0.5):  # Gauss: two points give the mean of a cubic exactly
-            u = middle + side * length / math.sqrt(3)
-            x, y, _ = corners.at(u)
-            mean = mean + (edges_of(x, y) * ((1 - u) * plane[0] + u * plane[1])).sum(0)
-        sign = sign * (mean * sign >= 0)
-    return sign
-
-
-def _break_ties(e: Tensor, x: Tensor, y: Tensor, w: Tensor) -> Tensor:
-    """Return `e` (3, m) with each zero replaced by the first of its slopes along the ray's x and y that is not."""
+    early, late = torch.minimum(roots[:3], roots[3:]), torch.maximum(roots[:3], roots[3:])
+    ends = [torch.zeros_like(early), early, late, torch.ones_like(early)]
+    coefficient = edge_coefficients(corners)
+    steady = (coefficient > 0).all(0).to(torch.int8) - (coefficient < 0).all(0).to(torch.int8)
+    bend = edges_of(corners.x[1] - corners.x[0], corners.y[1] - corners.y[0]) / 12
     i, j = list(FIRST), list(SECOND)
-    sign = torch.tensor(EDGE_SIGN, dtype=e.dtype, device=e.device).unsqueeze(1)
-    slope_x, slope_y = sign * cross(y[i], w[i], y[j], w[j]), sign * cross(w[i], x[i], w[j], x[j])
+    turn = torch.tensor(EDGE_SIGN, dtype=bend.dtype, device=bend.device).unsqueeze(1)
+    signs = []
+    for start, end in itertools.pairwise(ends):
+        u = 0.5 * (start + end)
+        a, b = (tuple((1 - u) * c[0, k] + u * c[1, k] for c in (corners.x, corners.y, corners.w)) for k in (i, j))
+        e = turn * cross(a[0], a[1], b[0], b[1]) + bend * (end - start).square()  # mean: middle plus bend / 12
+        e = _break_ties(e, a, b) if (e == 0).any() else e
+        signs.append(torch.where(steady != 0, steady, e.sign().to(torch.int8)))
+    return torch.stack(signs)
+
+
+def _break_ties(e: Tensor, a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
+    """Return `e` (3, m) with each zero replaced by the first of its slopes along the ray's x and y that is not; `a` and
+    `b` are x, y, w (3, m) of the edges' corners.
+    """
+    turn = torch.tensor(EDGE_SIGN, dtype=e.dtype, device=e.device).unsqueeze(1)
+    slope_x, slope_y = turn * cross(a[1], a[2], b[1], b[2]), turn * cross(a[2], a[0], b[2], b[0])
     return torch.where(e != 0, e, torch.where(slope_x != 0, slope_x, slope_y))
+
+
+def inside_sign(signs: Tensor, roots: Tensor, u: Tensor) -> Tensor:
+    """Return the common sign of the e_i (m,) int8 at local times `u` away from the roots: +1 or -1 inside, 0 outside.
+
+    Args:
+        signs: (3, 3, m) of `edge_signs`.
+        roots: (6, m) of `edge_roots`.
+        u: (m,).
+
+    Source: Ronnow et al. 2021, sec. 3.
+    """
+    early, late = torch.minimum(roots[:3], roots[3:]), torch.maximum(roots[:3], roots[3:])
+    index = (u > early).long() + (u > late).long()
+    sign = signs.gather(0, index.unsqueeze(0)).squeeze(0)
+    return (sign > 0).all(0).to(torch.int8) - (sign < 0).all(0).to(torch.int8)
+
+
+def plane_mean(corners: Corners, plane: Tensor, u_start: Tensor, u_end: Tensor) -> Tensor:
+    """Return the mean (m,) of a clip plane's N over pieces of time.
+
+    Args:
+        corners: m pairs.
+        plane: (2, 3, m) value of the plane at the corners.
+        u_start, u_end: (m,) the piece, in local time.
+
+    Source: Gauss's rule with two points, exact for the cubic.
+    """
+    middle, length = 0.5 * (u_start + u_end), u_end - u_start
+    mean = torch.zeros_like(middle)
+    for side in (-0.5, 0.5):
+        u = middle + side * length / math.sqrt(3)
+        x, y, _ = corners.at(u)
+        mean = mean + 0.5 * (edges_of(x, y) * ((1 - u) * plane[0] + u * plane[1])).sum(0)
+    return mean

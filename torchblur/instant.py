@@ -3,7 +3,8 @@
 Before: scene.py, surfaces.py.  After: sampling.py, the user.
 Symbols: B instants at once, T triangles (faces at instants), n fragments; e_i edge function opposite corner i,
 bary_i = e_i / sum e. Owner of a fragment: instant * H * W + pixel. Shares nothing with the interval code but the
-camera, the appearance of faces and the rules that make an image unambiguous (edges on a ray, coplanar faces).
+camera, the motion of vertices, the appearance of faces, and the rules that make an image unambiguous (edges on a ray,
+coplanar faces).
 Source: Olano & Greer 1997 (homogeneous rasterisation).
 """
 
@@ -15,8 +16,8 @@ import torch
 from torch import Tensor
 
 from torchblur import check, packed
-from torchblur.camera import clip_to_px, pixel_rays, project_world
-from torchblur.scene import Mesh, Scene
+from torchblur.camera import clip_to_px, pixel_rays
+from torchblur.scene import Scene
 from torchblur.sort import argsort_by, is_tied, reorder_ties
 from torchblur.surfaces import Surfaces, build_surfaces
 
@@ -156,33 +157,13 @@ def _displacement_px(scene: Scene, visible: tuple[Tensor, Tensor, Tensor], t: fl
         row, column = (mesh_id == i).nonzero(as_tuple=True)
         if len(row) == 0:
             continue
-        corners = clip_at(mesh, scene, at)[0][mesh.faces[face_id[row, column]]]  # (n, 3, 4)
+        corners = scene.clip_at(mesh, at)[0][mesh.faces[face_id[row, column]]]  # (n, 3, 4)
         weight = bary[row, column]
         weight = torch.cat([1 - weight.sum(1, keepdim=True), weight], dim=1)
         place = clip_to_px((weight.unsqueeze(2) * corners).sum(1), w, h)
         centre = torch.stack([column, row], dim=1).to(torch.float64) + 0.5
         out = out.index_put((row, column), place - centre)
     return out
-
-
-def clip_at(mesh: Mesh, scene: Scene, t: Tensor) -> Tensor:
-    """Return (B, V, 4) float64 clip-space vertices at the shutter times `t` (B,).
-
-    Between the knots of mesh and camera together, clip space is linear in time: the motion model of the exposure.
-    Source: Ronnow et al. 2021, sec. 3; several segments ours.
-    """
-    camera = scene.camera
-    knots = sorted({k / n for n in (mesh.n_segments, camera.n_segments, 1) for k in range(n + 1) if n})
-    merged = [k for i, k in enumerate(knots) if i == 0 or k - knots[i - 1] > 1e-12]
-    if mesh.n_segments == camera.n_segments == 0:
-        merged = [0.0]
-    at = torch.tensor(merged, dtype=torch.float64, device=t.device)
-    clip = project_world(mesh.vertices_at(at), camera.world_to_clip_at(at))
-    if len(merged) == 1:
-        return clip.expand(len(t), -1, -1)
-    segment = (torch.searchsorted(at, t, right=True) - 1).clamp(0, len(merged) - 2)
-    share = ((t - at[segment]) / (at[segment + 1] - at[segment])).reshape(-1, 1, 1)
-    return (1 - share) * clip[segment] + share * clip[segment + 1]
 
 
 def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[float, float]) -> Tensor:
@@ -204,7 +185,7 @@ def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[
 def _fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[float, float]):
     """Yield the fragments of the instants `t` (B,), a few instants or a band of faces at a time."""
     camera = scene.camera
-    parts = [clip_at(m, scene, t)[:, m.faces] for m in scene.meshes]
+    parts = [scene.clip_at(m, t)[:, m.faces] for m in scene.meshes]
     if not parts:
         return
     clip = torch.cat(parts, dim=1)  # (B, F, 3, 4)

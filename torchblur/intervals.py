@@ -194,7 +194,9 @@ def _covered_pieces(prisms: Prisms, prism: Tensor, corners: Corners) -> tuple[Te
     """
     w = corners.w
     is_clipped = bool(prisms.is_clipped[prism[:1]].any())  # all pairs of one call are alike
-    cuts = [edges.edge_roots(corners)]
+    roots = edges.edge_roots(corners)
+    edge_signs = edges.edge_signs(corners, roots)
+    cuts = [roots]
     kinds = [0, 1, 2, 0, 1, 2]
     planes = []
     if is_clipped:
@@ -210,17 +212,14 @@ def _covered_pieces(prisms: Prisms, prism: Tensor, corners: Corners) -> tuple[Te
 
     one_sided = prisms.surfaces.is_one_sided[prisms.face_of[prism]]
     hidden_sign = torch.where(one_sided, -prisms.parity[prism], 0).to(torch.int8)
-    sign = torch.zeros(len(u), u.shape[1] - 1, dtype=torch.int8, device=u.device)
-    for k in range(sign.shape[1]):
-        real = (u[:, k] < u[:, k + 1]).nonzero().flatten()  # most pairs have few roots: later pieces are rare
-        few = len(real) < len(u) // 2
-        part, clip_planes = (corners[real], [p[..., real] for p in planes]) if few else (corners, planes)
-        start, end = (u[real, k], u[real, k + 1]) if few else (u[:, k], u[:, k + 1])
-        side = edges.inside_sign(part, clip_planes, start, end)
-        if few:
-            sign[real, k] = side
-        else:
-            sign[:, k] = side * (start < end)
+    pieces = []
+    for k in range(u.shape[1] - 1):
+        start, end = u[:, k], u[:, k + 1]
+        side = edges.inside_sign(edge_signs, roots, 0.5 * (start + end)) * (start < end)
+        for plane in planes:
+            side = side * (edges.plane_mean(corners, plane, start, end) * side >= 0)
+        pieces.append(side)
+    sign = torch.stack(pieces, dim=1)
     sign = torch.where(sign == hidden_sign.unsqueeze(1), 0, sign)
     nothing = torch.zeros_like(sign[:, :1])
     begins = (sign != 0) & (sign != torch.cat([nothing, sign[:, :-1]], dim=1))

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchblur.camera import project_world
 from torchblur.scene import Mesh, Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import Surfaces
@@ -65,12 +64,12 @@ def build_prisms(scene: Scene, surfaces: Surfaces, shutter: Shutter) -> Prisms:
     for i, mesh in enumerate(scene.meshes):
         if mesh.n_faces == 0:
             continue
-        times = knot_times(mesh, scene, shutter)
-        knots = times[:1] if mesh.n_segments == camera.n_segments == 0 else times
-        at = torch.tensor(knots, dtype=torch.float64, device=scene.device)
-        clip_vertices = project_world(mesh.vertices_at(at), camera.world_to_clip_at(at))
+        times = window_times(scene, mesh, shutter)
+        is_static = mesh.n_segments == camera.n_segments == 0
+        at = torch.tensor(times[:1] if is_static else times, dtype=torch.float64, device=scene.device)
+        clip_vertices = scene.clip_at(mesh, at)
         clip = clip_vertices[:, mesh.faces]  # (knots, F, 3, 4)
-        clip_open, clip_close = (clip, clip) if len(knots) == 1 else (clip[:-1], clip[1:])
+        clip_open, clip_close = (clip, clip) if is_static else (clip[:-1], clip[1:])
         n_segments = len(clip_open)
         both = torch.stack([clip_open, clip_close]).flatten(1, 2).permute(0, 2, 3, 1)  # (2, 3, 4, segments * F)
         span = torch.tensor(times, dtype=torch.float64, device=scene.device)
@@ -88,11 +87,10 @@ def build_prisms(scene: Scene, surfaces: Surfaces, shutter: Shutter) -> Prisms:
     return _assemble(scene, surfaces, *(torch.cat(p, dim=-1) for p in zip(*parts, strict=True)))
 
 
-def knot_times(mesh: Mesh, scene: Scene, shutter: Shutter) -> list[float]:
-    """Return the shutter times at which the linear pieces of a mesh's screen motion meet, window ends included."""
-    inner = {k / n for n in (mesh.n_segments, scene.camera.n_segments) for k in range(1, n)}
+def window_times(scene: Scene, mesh: Mesh, shutter: Shutter) -> list[float]:
+    """Return the ends of the shutter's window and the knots of a mesh's motion between them."""
     times = [shutter.t_open]
-    for t in sorted(inner):
+    for t in scene.knot_times(mesh):
         if t - times[-1] > SAME_KNOT and shutter.t_close - t > SAME_KNOT:
             times.append(t)
     return [*times, shutter.t_close]

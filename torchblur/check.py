@@ -35,7 +35,7 @@ def fail(name: str, expected: str, got: Any) -> ValueError:
 
 
 def fail_type(name: str, expected: str, got: Any) -> TypeError:
-    """Return the TypeError to raise for an argument of the wrong type."""
+    """Return the TypeError to raise for an argument of the wrong type, which `got` is."""
     return TypeError(f"{name}: expected {expected}, got {describe(got)}")
 
 
@@ -52,17 +52,38 @@ def matches(value: Tensor, shape: Sequence[int | str]) -> bool:
 
 
 def as_tensor(name: str, value: Any) -> Tensor:
-    """Return `value` as a tensor without changing its dtype; Python numbers become float64 or int64."""
+    """Return `value` as a tensor without changing its dtype; Python numbers become float64.
+
+    Raises:
+        TypeError: neither a dense tensor with data, nor a numeric array, nor (nested) Python numbers.
+    """
+    expected = "a dense tensor, a numeric array or numbers"
     if isinstance(value, Tensor):
+        if value.layout != torch.strided or value.is_nested or value.is_quantized or value.is_meta:
+            kind = "meta" if value.is_meta else "nested or quantized" if value.layout == torch.strided else value.layout
+            raise TypeError(f"{name}: expected {expected}, got a tensor of kind {kind}")
         return value
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind not in "fiu" or not value.dtype.isnative:
-            raise fail_type(name, "a numeric array in native byte order", value)
-        return torch.as_tensor(np.array(value, order="C"))  # a copy: arrays may be read-only or change later
+    array = _as_array(name, value, expected)
+    if not isinstance(value, np.ndarray):
+        array = array.astype(np.float64)
+    return torch.as_tensor(np.array(array, order="C"))  # a copy: arrays may be read-only or change later
+
+
+def _as_array(name: str, value: Any, expected: str) -> np.ndarray:
+    """Return `value` as a numeric array of at most 64 bits, refusing what numpy would silently turn into one."""
+    if isinstance(value, (list, tuple)) and any(isinstance(part, Tensor) for part in value):
+        raise TypeError(f"{name}: expected {expected}, got a {type(value).__name__} of tensors: torch.stack them")
+    if isinstance(value, np.ma.MaskedArray):
+        raise TypeError(f"{name}: expected {expected}, got a masked array, whose mask would be lost")
     try:
-        return torch.as_tensor(np.asarray(value, dtype=np.float64))
-    except (TypeError, ValueError):
-        raise fail_type(name, "a tensor, an array or numbers", value) from None
+        array = np.asarray(value)
+    except (TypeError, ValueError, OverflowError):
+        raise fail_type(name, expected, value) from None
+    if array.size == 0 and not isinstance(value, np.ndarray):
+        array = array.astype(np.int64)
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8 or not array.dtype.isnative:
+        raise fail_type(name, expected, value)
+    return array
 
 
 def floats(name: str, value: Any, *shapes: Sequence[int | str]) -> Tensor:
@@ -94,12 +115,21 @@ def unit_range(name: str, value: Tensor) -> Tensor:
 
 
 def indices(name: str, value: Any, shape: Sequence[int | str], below: int) -> Tensor:
-    """Return `value` as int64 indices of `shape`, each in [0, below)."""
-    tensor = as_tensor(name, value)
+    """Return `value` as int64 indices of `shape`, each in [0, below); an empty list counts as no rows."""
+    expected = f"{shape_text(shape)} integers"
+    if isinstance(value, Tensor):
+        tensor = as_tensor(name, value)
+    else:
+        array = _as_array(name, value, expected)
+        if array.size == 0 and array.ndim == 1:
+            array = array.reshape(0, *shape[1:])
+        if array.dtype.kind == "u" and array.size and array.max() > np.iinfo(np.int64).max:
+            raise fail(name, f"indices in [0, {below})", f"{array.max()}")
+        tensor = torch.as_tensor(array.astype(np.int64) if array.dtype.kind in "iu" else np.array(array))
     if tensor.dtype not in INTEGERS:
-        raise fail_type(name, f"{shape_text(shape)} integers", tensor)
+        raise fail_type(name, expected, tensor)
     if not matches(tensor, shape):
-        raise fail(name, f"{shape_text(shape)} integers", tensor)
+        raise fail(name, expected, tensor)
     outside = (tensor < 0) | (tensor >= below)
     if outside.any():
         raise fail(name, f"indices in [0, {below})", f"{int(tensor[outside][0])}")

@@ -123,7 +123,7 @@ def render(
         rgb = total[..., :3] + (1 - alpha) * scene.background.to(total)
         rgba = torch.cat([rgb, alpha], dim=-1).to(scene.dtype)
         for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
-            rgba = rgba + 0.0 * leaf.sum().to(rgba) if leaf.requires_grad else rgba
+            rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
     return Frame(rgba, coverage.to(scene.dtype), ledger.counts, ledger.timings)
 
 

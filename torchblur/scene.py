@@ -6,7 +6,6 @@ Symbols: V vertices, F faces, K segments of a motion (K+1 knots at equally space
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -76,11 +75,9 @@ class Mesh:
         vertices = check.floats("vertices", self.vertices, ("V", 3), ("K+1", "V", 3))
         if vertices.ndim == 3 and len(vertices) < 2:
             raise check.fail("vertices", "(V, 3), or (K+1, V, 3) with at least 2 knots", vertices)
-        given = self.faces
-        if not isinstance(given, Tensor) and not hasattr(given, "dtype"):
-            given = torch.as_tensor(given, device=vertices.device)
-            given = given.reshape(0, 3).long() if given.numel() == 0 else given
-        faces = check.indices("faces", given, ("F", 3), vertices.shape[-2])
+        faces = check.indices("faces", self.faces, ("F", 3), vertices.shape[-2])
+        if not isinstance(self.faces, Tensor):
+            faces = faces.to(vertices.device)
         if not isinstance(self.material, Material):
             raise check.fail_type("material", "a Material", self.material)
         color, opacity = self.material.color, self.material.opacity
@@ -130,12 +127,12 @@ class Scene:
         TypeError, ValueError: a wrong argument, named; tensors on several devices.
     """
 
-    meshes: Sequence[Mesh]
+    meshes: list[Mesh] | tuple[Mesh, ...]
     camera: Camera
     background: Any = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.meshes, Sequence) or not all(isinstance(m, Mesh) for m in self.meshes):
+        if not isinstance(self.meshes, (list, tuple)) or not all(isinstance(m, Mesh) for m in self.meshes):
             raise check.fail_type("meshes", "a sequence of Mesh", self.meshes)
         if not isinstance(self.camera, Camera):
             raise check.fail_type("camera", "a Camera", self.camera)

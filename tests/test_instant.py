@@ -211,3 +211,36 @@ def test_image_is_the_same_at_segment_ends_from_both_sides():
     a, b = instant(scene, 0.5 - 1e-12), instant(scene, 0.5)
     torch.testing.assert_close(a.motion_px, b.motion_px, rtol=0, atol=1e-8)
     assert torch.equal(a.face_id, b.face_id)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-17, -1e-12, 1e-7])
+@pytest.mark.parametrize("row", [0, 2])
+def test_a_matrix_that_is_orthographic_up_to_rounding_orders_by_depth(noise, row):
+    """A last row of (0, 0, 1e-17, 1) must not make 1 / w, which says nothing about depth here, the order."""
+    square = torch.tensor([[-2.0, -2, 0], [2, -2, 0], [0, 3, 0]], dtype=torch.float64)
+    shift = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    near = tb.Mesh(torch.stack([square + shift, square + 1.1 * shift]), [[0, 1, 2]], tb.Material((1.0, 0, 0)))
+    far = tb.Mesh(square, [[0, 1, 2]], tb.Material((0.0, 1, 0)))
+    straight = tb.Camera.orthographic((0, 0, 5), (0, 0, 0), height_world=2, width=2, height=2, near=0.1, far=10)
+    matrix = straight.world_to_clip.clone()
+    matrix[3, row] = noise
+    scene = tb.Scene([far, near], tb.Camera(matrix, 2, 2, depth_at_near=0.1))
+    assert tb.render(scene).rgba[0, 0].tolist() == [1, 0, 0, 1]
+    now = tb.render_instant(scene, 0.0)
+    assert now.rgba[0, 0].tolist() == [1, 0, 0, 1]
+    assert float(now.depth_view[0, 0]) == pytest.approx(4.0, abs=1e-5)
+
+
+def test_an_instant_in_portions_is_the_instant(monkeypatch):
+    """Deep overdraw is worked off in rectangles of pixels: the image must not show it."""
+    generator = torch.Generator().manual_seed(3)
+    vertices = (torch.rand(2, 90, 3, dtype=torch.float64, generator=generator) - 0.5) * 3
+    mesh = tb.Mesh(vertices, torch.arange(90).reshape(30, 3), tb.Material(torch.rand(30, 3, generator=generator), 0.5))
+    camera = tb.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y_deg=60, width=23, height=17, near=0.1, far=10)
+    scene = tb.Scene([mesh], camera)
+    whole, mean = tb.render_instant(scene, 0.4), tb.accumulate(scene, 5)
+    monkeypatch.setattr("torchblur.fragments.MAX_PAIRS", 40)
+    parts = tb.render_instant(scene, 0.4)
+    for name in ("rgba", "depth_view", "motion_px", "mesh_id", "face_id", "bary"):
+        torch.testing.assert_close(getattr(parts, name), getattr(whole, name), rtol=0, atol=0)
+    torch.testing.assert_close(tb.accumulate(scene, 5).rgba, mean.rgba, rtol=0, atol=1e-15)

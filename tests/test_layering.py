@@ -37,6 +37,7 @@ TORCHBLUR = [
     "shading",
     "shadows",
     "resolve",
+    "fragments",
     "instant",
     "sampling",
     "metrics",

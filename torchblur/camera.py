@@ -18,6 +18,7 @@ from torch import Tensor
 from torchblur import check
 
 MAX_SIZE_PX = 32768  # a side; keeps (pixel, prism) indices of one block far inside int64 and guards against slips
+AFFINE = 1e-5  # rows of w smaller than this share of the rows of z are those of an orthographic camera, rounded
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +61,21 @@ class Camera:
 
     @property
     def is_perspective(self) -> bool:
-        """Whether w depends on the point at every knot, so that w is the view depth."""
-        row_w = self.world_to_clip.detach()[..., 3, :3]
-        return bool((row_w != 0).any(-1).all())
+        """Whether w is the view depth, rather than 1 up to rounding, at every knot."""
+        matrix = self.world_to_clip.detach()
+        return bool((matrix[..., 3, :3].norm(dim=-1) > AFFINE * matrix[..., 2, :3].norm(dim=-1)).all())
+
+    @property
+    def orders_by_w(self) -> bool:
+        """Whether 1 / w tells surfaces along a ray apart better than z / w does, at every knot.
+
+        With z = a w + b, b < 0, as projections have it, w spans a factor of (a + 1) / (a - 1) between the clip
+        planes: from a factor of 2 on, 1 / w is the better key, below it z / w, which orders any matrix.
+        """
+        row_z, row_w = self.world_to_clip.detach().to(torch.float64)[..., 2:, :].unbind(-2)
+        slope = (row_z[..., :3] * row_w[..., :3]).sum(-1) / row_w[..., :3].square().sum(-1)
+        offset = row_z[..., 3] - slope * row_w[..., 3]
+        return self.is_perspective and bool(((slope > 1 - AFFINE) & (slope <= 3) & (offset < 0)).all())
 
     def world_to_clip_at(self, t: Tensor) -> Tensor:
         """Return (N, 4, 4) float64 matrices at the shutter times `t` (N,): linear between the knots."""

@@ -1,11 +1,7 @@
-"""The scene at one instant: colour, alpha, depth, motion and ids, by ordinary rasterisation.
+"""The scene at one instant: colour, alpha, depth, motion and ids.
 
-Before: scene.py, surfaces.py.  After: sampling.py, the user.
-Symbols: B instants at once, T triangles (faces at instants), n fragments; e_i edge function opposite corner i,
-bary_i = e_i / sum e. Owner of a fragment: instant * H * W + pixel. Shares nothing with the interval code but the
-camera, the motion of vertices, the appearance of faces, and the rules that make an image unambiguous (edges on a ray,
-coplanar faces).
-Source: Olano & Greer 1997 (homogeneous rasterisation).
+Before: fragments.py.  After: sampling.py, the user.
+Symbols: B instants at once; bary_i barycentrics of a face's corners.
 """
 
 from __future__ import annotations
@@ -17,13 +13,11 @@ from torch import Tensor
 
 from torchblur import check, packed
 from torchblur.camera import clip_to_px, pixel_rays
+from torchblur.fragments import find_fragments
 from torchblur.scene import Scene
-from torchblur.sort import argsort_by, is_tied, reorder_ties
 from torchblur.surfaces import Surfaces, build_surfaces
 
-MAX_PAIRS = 2_000_000  # pairs of triangle and pixel looked at together: about 1 GB of working memory
 MAX_RAYS = 4096
-MIN_W = 1e-300  # against division by zero where a corner is discarded anyway
 
 
 @dataclass(frozen=True)
@@ -41,16 +35,6 @@ class Instant:
     mesh_id: Tensor  # (H, W) int64 index of the mesh; -1 where nothing is visible
     face_id: Tensor  # (H, W) int64 index of the face in its mesh; -1
     bary: Tensor  # (H, W, 2) barycentrics of the face's corners 1 and 2 at the visible point; 0 if none
-
-
-@dataclass(frozen=True)
-class _Fragments:
-    """Surfaces seen by rays, by owner, nearest first."""
-
-    offsets: Tensor  # (owners + 1,)
-    face: Tensor  # (n,) int64 face of the scene
-    bary: Tensor  # (3, n) float64
-    depth_view: Tensor  # (n,) float64
 
 
 def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> Instant:
@@ -82,7 +66,7 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     face = torch.full((n_pixels,), -1, dtype=torch.int64, device=device)
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
-    for fragments in _fragments(scene, surfaces, at, (0.5, 0.5)):
+    for fragments in find_fragments(scene, surfaces, at, (0.5, 0.5)):
         seen = (surfaces.opacity.detach()[fragments.face] > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
         first = seen[packed.offsets_from_counts(count)[:-1]]
@@ -171,7 +155,7 @@ def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[
     camera = scene.camera
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
-    for fragments in _fragments(scene, surfaces, t, ray_px):
+    for fragments in find_fragments(scene, surfaces, t, ray_px):
         alpha = surfaces.opacity[fragments.face]
         before, after = packed.transmittance(alpha, fragments.offsets)
         light = (before * alpha).unsqueeze(1) * surfaces.rgb[fragments.face]
@@ -180,112 +164,3 @@ def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[
     image = (total / len(t)).reshape(camera.height, camera.width, 4)
     alpha = image[..., 3:]
     return torch.cat([image[..., :3] + (1 - alpha) * scene.background.to(image), alpha], dim=-1)
-
-
-def _fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[float, float]):
-    """Yield the fragments of the instants `t` (B,), a few instants or a band of faces at a time."""
-    camera = scene.camera
-    parts = [scene.clip_at(m, t)[:, m.faces] for m in scene.meshes]
-    if not parts:
-        return
-    clip = torch.cat(parts, dim=1)  # (B, F, 3, 4)
-    visible = surfaces.opacity.detach() > 0
-    if surfaces.opacity.requires_grad:
-        visible = torch.ones_like(visible)
-    box, count = _boxes(clip.detach().flatten(0, 1), camera.width, camera.height, ray_px)
-    count = torch.where(visible.repeat(len(t)), count, 0)
-    per_instant = count.reshape(len(t), -1).sum(1)
-    first = 0
-    running = torch.cumsum(per_instant, 0)
-    while first < len(t):
-        done = int(running[first - 1]) if first else 0
-        last = max(first + 1, int(torch.searchsorted(running, done + MAX_PAIRS, right=True)))
-        n_faces = clip.shape[1]
-        chosen = slice(first * n_faces, last * n_faces)
-        triangles = clip[first:last].flatten(0, 1)
-        yield _rasterise(scene, surfaces, (triangles, box[:, chosen], count[chosen]), (t[first:last], ray_px))
-        first = last
-
-
-def _boxes(clip: Tensor, width: int, height: int, ray_px: tuple[float, float]) -> tuple[Tensor, Tensor]:
-    """Return first column, first row and columns (3, T) of the pixels a triangle (T, 3, 4) may cover, and how many."""
-    near = clip[..., 2] + clip[..., 3]
-    points, valid = [clip], [near >= 0]
-    following = clip.roll(-1, dims=1)
-    near_following = near.roll(-1, dims=1)
-    apart = (near >= 0) != (near_following >= 0)
-    share = near / torch.where(apart, near - near_following, 1.0)
-    points.append(clip + share.unsqueeze(-1) * (following - clip))
-    valid.append(apart)
-    point, ok = torch.cat(points, dim=1), torch.cat(valid, dim=1)
-    w = torch.where(ok, point[..., 3], 1.0)
-    everywhere = (w <= 0).any(1)
-    w = w.clamp(min=MIN_W)
-    first, count = [], []
-    for axis, size, sign in ((0, width, 1), (1, height, -1)):
-        place = (sign * point[..., axis] / w + 1) * (size / 2) - ray_px[axis]
-        low = torch.where(ok, place, torch.inf).amin(1)
-        high = torch.where(ok, place, -torch.inf).amax(1)
-        low = torch.where(everywhere, -torch.inf, low - 1e-6).clamp(0, size).ceil()
-        high = torch.where(everywhere, torch.inf, high + 1e-6).clamp(-1, size - 1).floor()
-        first.append(low.long())
-        count.append((high - low + 1).clamp(min=0).long())
-    return torch.stack([*first, count[0]]), count[0] * count[1]
-
-
-def _rasterise(
-    scene: Scene,
-    surfaces: Surfaces,
-    triangles: tuple[Tensor, Tensor, Tensor],
-    instants: tuple[Tensor, tuple[float, float]],
-) -> _Fragments:
-    """Return the fragments of triangles (T, 3, 4) with their boxes and pixel counts, T = instants * faces."""
-    clip, box, count = triangles
-    t, ray_px = instants
-    camera = scene.camera
-    n_faces, n_pixels = len(surfaces.opacity), camera.width * camera.height
-    local, triangle = packed.expand(torch.zeros_like(count), count)
-    column = box[0][triangle] + local % box[2][triangle]
-    row = box[1][triangle] + local // box[2][triangle]
-    x_ndc = 2 * (column.to(torch.float64) + ray_px[0]) / camera.width - 1
-    y_ndc = 1 - 2 * (row.to(torch.float64) + ray_px[1]) / camera.height
-    sign = _inside(clip.detach(), triangle, (x_ndc, y_ndc))
-    front_only = surfaces.is_one_sided[triangle % n_faces]
-    kept = ((sign != 0) & ~(front_only & (sign < 0))).nonzero().flatten()
-    triangle, row, column, x_ndc, y_ndc = (a[kept] for a in (triangle, row, column, x_ndc, y_ndc))
-    corner = clip[triangle]  # (n, 3, 4)
-    z, w = corner[..., 2].T, corner[..., 3].T
-    e = _edge_values(corner[..., 0].T - x_ndc * w, corner[..., 1].T - y_ndc * w)
-    bary = e / e.sum(0)
-    z_hit, w_hit = (bary * z).sum(0), (bary * w).sum(0)
-    kept = ((z_hit + w_hit >= 0) & (w_hit - z_hit >= 0) & torch.isfinite(bary).all(0)).nonzero().flatten()
-    z_hit, w_hit, triangle = z_hit[kept], w_hit[kept], triangle[kept]
-    owner = (triangle // n_faces) * n_pixels + row[kept] * camera.width + column[kept]
-    face = triangle % n_faces
-    nearness = 1 / w_hit if camera.is_perspective else 2 - z_hit / w_hit
-    order = argsort_by(owner, -nearness.detach())
-    tied = is_tied(owner[order], nearness.detach()[order])
-    order = reorder_ties(order, tied, surfaces.tie_rank[face])
-    depth = w_hit
-    if not camera.is_perspective:
-        scale = camera.world_to_clip_at(t)[triangle // n_faces][:, 2, :3].norm(dim=1)
-        depth = camera.depth_at_near + (z_hit / w_hit + 1) / scale
-    offsets = packed.offsets_from_owners(owner[order], len(t) * n_pixels)
-    return _Fragments(offsets, face[order], bary[:, kept][:, order], depth[order])
-
-
-def _edge_values(x: Tensor, y: Tensor) -> Tensor:
-    """Return e (3, n) of reduced corners x, y (3, n), e_i opposite corner i."""
-    return x.roll(-1, 0) * y.roll(-2, 0) - y.roll(-1, 0) * x.roll(-2, 0)
-
-
-def _inside(clip: Tensor, triangle: Tensor, ray_ndc: tuple[Tensor, Tensor]) -> Tensor:
-    """Return +1 where the ray is inside and the face turns counter-clockwise, -1 where clockwise, 0 outside (n,)."""
-    w = clip[:, :, 3].T[:, triangle]
-    x = clip[:, :, 0].T[:, triangle] - ray_ndc[0] * w
-    y = clip[:, :, 1].T[:, triangle] - ray_ndc[1] * w
-    e = _edge_values(x, y)
-    if (e == 0).any():  # an edge on the ray counts as if the ray were moved by (eps, eps^2)
-        along_x, along_y = _edge_values(y, w), _edge_values(w, x)
-        e = torch.where(e != 0, e, torch.where(along_x != 0, along_x, along_y))
-    return (e > 0).all(0).long() - (e < 0).all(0).long()

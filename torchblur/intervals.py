@@ -2,7 +2,7 @@
 
 Before: prisms.py, edges.py.  After: cells.py.
 Symbols: P prisms, n pairs of prism and pixel, N intervals; t shutter time; u local time of a prism, 0 at its open end.
-Nearness = M / D orders surfaces along the ray, larger in front: 1 / w under perspective, 2 - z / w otherwise; M and D
+Nearness = M / D orders surfaces along the ray, larger in front: 1 / w or 2 - z / w, see `Camera.orders_by_w`; M and D
 are cubics in time, kept by their Bernstein coefficients over the interval.
 Source: Ronnow et al. 2021, sec. 4 (intervals), 2022, eq. 1-3 (depth); signs over pieces of time instead of paired hits,
 clip planes as cubics, tie rule: ours.
@@ -155,8 +155,8 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
 def nearness_coefficients(prisms: Prisms, prism: Tensor, corners: Corners, u: Tensor) -> tuple[Tensor, Tensor]:
     """Return the Bernstein coefficients (4, m) of M and D over a slice of time; M / D is larger in front.
 
-    Perspective: M = S, so that nearness is 1 / w. Else M = sum e_i (2 w_i - z_i): nearness 2 - z / w, which is
-    positive inside the clip volume, so that relative tolerances mean something.
+    By w: M = S, so that nearness is 1 / w. Else M = sum e_i (2 w_i - z_i): nearness 2 - z / w, which is positive
+    inside the clip volume, so that relative tolerances mean something.
 
     Args:
         prisms: of the scene.
@@ -168,7 +168,7 @@ def nearness_coefficients(prisms: Prisms, prism: Tensor, corners: Corners, u: Te
     """
     e = edges.edge_coefficients(corners)
     den = bernstein.product(e, corners.w).sum(1)
-    if prisms.is_perspective:
+    if prisms.orders_by_w:
         s = e.sum(1)
         return torch.stack([s[0], (s[0] + 2 * s[1]) / 3, (2 * s[1] + s[2]) / 3, s[2]]), den
     z = prisms.clip[:, :, 2].index_select(-1, prism)
@@ -247,7 +247,7 @@ def nearness_at(prisms: Prisms, prism: Tensor, ray_ndc: Tensor, t: Tensor) -> tu
     u = (t - prisms.t_open[prism]) / span
     (e, de), (w, dw), (z, dz) = _moving(prisms, prism, ray_ndc, u)
     den, dden = (e * w).sum(0), (de * w + e * dw).sum(0)
-    plane, dplane = (torch.ones_like(w), torch.zeros_like(w)) if prisms.is_perspective else (2 * w - z, 2 * dw - dz)
+    plane, dplane = (torch.ones_like(w), torch.zeros_like(w)) if prisms.orders_by_w else (2 * w - z, 2 * dw - dz)
     num, dnum = (e * plane).sum(0), (de * plane + e * dplane).sum(0)
     return num, den, dnum / span, dden / span
 

@@ -37,7 +37,7 @@ class Prisms:
     is_clipped: Tensor  # (P,) bool: reaches beyond the near or the far plane
     bounds_px: Tensor  # (4, P) float64 x0 y0 x1 y1 of the swept area on screen [px], conservative
     surfaces: Surfaces  # what the faces look like
-    is_perspective: bool  # w is the view depth
+    orders_by_w: bool  # depth order by 1 / w, else by z / w
 
     @property
     def count(self) -> int:
@@ -129,7 +129,7 @@ def _assemble(
         is_clipped=is_clipped[kept],
         bounds_px=bounds[:, kept],
         surfaces=surfaces,
-        is_perspective=scene.camera.is_perspective,
+        orders_by_w=scene.camera.orders_by_w,
     )
 
 

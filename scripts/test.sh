@@ -3,4 +3,5 @@
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 .venv/bin/ruff check .
 .venv/bin/ruff format --check .
-.venv/bin/python -m pytest "$@"
+export OMP_NUM_THREADS=1 # tests are many and small: one thread each, on two processes
+.venv/bin/python -m pytest --numprocesses 2 "$@"

@@ -2,6 +2,7 @@
 
 Before: fragments.py.  After: sampling.py, the user.
 Symbols: B instants at once; bary_i barycentrics of a face's corners.
+Source: ours; the displacement of a visible point is that of its barycentrics.
 """
 
 from __future__ import annotations

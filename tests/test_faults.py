@@ -16,7 +16,7 @@ import test_instant
 import test_seams
 import torch
 
-from torchblur import cells, edges, instant, intervals, packed, prisms, resolve, sampling, surfaces
+from torchblur import cells, edges, instant, intervals, packed, prisms, sampling, surfaces
 from torchblur.shutter import Shutter
 
 FLOAT64 = torch.float64
@@ -96,11 +96,11 @@ def plant_transmittance_ignored(patch):
 
 
 def plant_weights_not_by_time(patch):
-    patch.setattr(Shutter, "weight", lambda self, a, b: torch.full_like(a, 0.125))
+    patch.setattr(Shutter, "weight", lambda self, a, b, line: torch.full_like(a, 0.125))
 
 
 def plant_window_not_normalised(patch):
-    patch.setattr(Shutter, "weight", lambda self, a, b: b - a)
+    patch.setattr(Shutter, "weight", lambda self, a, b, line: b - a)
 
 
 def plant_tie_rule_dropped(patch):
@@ -135,7 +135,7 @@ def plant_background_not_weighted(patch):
     def wrong(result):
         return dataclasses.replace(result, alpha=torch.ones_like(result.alpha))
 
-    patch.setattr(render, "resolve_cells", changed(render.resolve_cells, wrong))
+    patch.setattr(render, "expose_cells", changed(render.expose_cells, wrong))
 
 
 def plant_segment_times_wrong(patch):
@@ -172,8 +172,10 @@ def plant_second_root_lost(patch):
 
 
 def plant_coverage_counted_twice(patch):
-    original = resolve._coverage
-    patch.setattr(resolve, "_coverage", lambda cell, weight, visible, n: 2 * original(cell, weight, visible, n))
+    def wrong(result):
+        return dataclasses.replace(result, coverage=2 * result.coverage)
+
+    patch.setattr(render, "expose_cells", changed(render.expose_cells, wrong))
 
 
 def plant_ties_by_input_order(patch):
@@ -197,9 +199,11 @@ def plant_motion_upside_down(patch):
 
 
 def plant_accumulation_at_frame_starts(patch):
-    original = sampling.mean_of_instants
+    original = sampling.sum_of_instants
     patch.setattr(
-        sampling, "mean_of_instants", lambda scene, faces, t, ray: original(scene, faces, (t - t[0]).clamp(0, 1), ray)
+        sampling,
+        "sum_of_instants",
+        lambda scene, faces, t, *rest: original(scene, faces, (t - t[0]).clamp(0, 1), *rest),
     )
 
 

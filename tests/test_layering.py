@@ -29,6 +29,7 @@ TORCHBLUR = [
     "prisms",
     "bernstein",
     "edges",
+    "pairs",
     "intervals",
     "subdivide",
     "sort",

@@ -7,7 +7,8 @@ import torch
 
 import torchblur as tb
 from torchblur import edges
-from torchblur.intervals import Block, find_intervals
+from torchblur.intervals import find_intervals
+from torchblur.pairs import Block
 from torchblur.prisms import build_prisms, canonical_corners, swept_bounds_px, window_times
 from torchblur.surfaces import build_surfaces
 
@@ -71,8 +72,8 @@ def scene_with(k_mesh, k_camera, t_open=0.0, t_close=1.0):
 )
 def test_knots_of_mesh_camera_and_shutter_are_joined(k_mesh, k_camera, window, expected):
     scene, shutter = scene_with(k_mesh, k_camera, *window)
-    assert window_times(scene, scene.meshes[0], shutter) == pytest.approx(expected, abs=1e-15)
-    prisms = build_prisms(scene, build_surfaces(scene), shutter)
+    assert window_times(scene, scene.meshes[0], (shutter.t_open, shutter.t_close)) == pytest.approx(expected, abs=1e-15)
+    prisms = build_prisms(scene, build_surfaces(scene), (shutter.t_open, shutter.t_close))
     assert prisms.count == len(expected) - 1
     assert prisms.t_open.tolist() == pytest.approx(expected[:-1], abs=1e-15)
 
@@ -99,7 +100,7 @@ def test_bounds_hold_all_swept_points_of_prisms_through_the_camera(generator):
 
 def test_no_ray_inside_the_bounds_is_forgotten_in_any_block(generator):
     scene, shutter = scene_with(1, 0)
-    prisms = build_prisms(scene, build_surfaces(scene), shutter)
+    prisms = build_prisms(scene, build_surfaces(scene), (shutter.t_open, shutter.t_close))
     every = torch.arange(prisms.count)
     whole, _ = find_intervals(prisms, Block(0, 0, 8, 8, (0.5, 0.5), 8, 8), every)
     parts = []

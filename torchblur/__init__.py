@@ -3,7 +3,7 @@
 from torchblur.accuracy import Accuracy
 from torchblur.camera import Camera
 from torchblur.instant import Instant, motion_to, render_instant
-from torchblur.render import Frame, render
+from torchblur.render import Frame, render, render_windows
 from torchblur.sampling import Accumulated, accumulate
 from torchblur.scene import Material, Mesh, Scene
 from torchblur.shutter import Shutter
@@ -23,4 +23,5 @@ __all__ = [
     "motion_to",
     "render",
     "render_instant",
+    "render_windows",
 ]

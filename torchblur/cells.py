@@ -21,7 +21,7 @@ from torchblur.prisms import Prisms
 from torchblur.sort import argsort_by, inverse, is_tied, reorder_ties
 
 CROSSING_NOISE = 1e-12  # of the largest product: smaller coefficients of F are rounding
-MIN_CELL = 1e-12  # shutter time: shorter cells are not searched for crossings; a pixel changes by at most as much
+MIN_CELL = 1e-12  # of the window: shorter cells are not searched for crossings; a pixel changes by at most as much
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,8 @@ def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Cr
     has_upper = torch.zeros_like(place, dtype=torch.bool)
     has_upper[1:] = layers.cell[1:] == layers.cell[:-1]
     length = layers.instant_t[layers.cell + 1] - layers.instant_t[layers.cell]
-    lower = (has_upper & (length > MIN_CELL)).nonzero().flatten()
+    least = MIN_CELL * (prisms.window[1] - prisms.window[0])
+    lower = (has_upper & (length > least)).nonzero().flatten()
     upper = torch.minimum(lower - 1, layers.last_seen[lower])
     pair = torch.stack([layers.interval[upper], layers.interval[lower]])
     low, high = _nearness_range(intervals)
@@ -211,7 +212,7 @@ def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Cr
     size = [c.abs().amax(0) for c in (num_i, den_i, num_j, den_j)]
     which, u = bernstein.roots(f, CROSSING_NOISE * (size[0] * size[3] + size[2] * size[1]))
     t = start[which] + u * (end - start)[which]
-    inner = ((t - start[which] > MIN_CELL) & (end[which] - t > MIN_CELL)).nonzero().flatten()
+    inner = ((t - start[which] > least) & (end[which] - t > least)).nonzero().flatten()
     which = which[inner]
     return Crossings(layers.instant_pixel[cell[which]], t[inner], pair[:, which])
 

@@ -62,7 +62,8 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     camera, device = scene.camera, scene.device
     at = torch.tensor([t], dtype=torch.float64, device=device)
     surfaces = build_surfaces(scene)
-    rgba = sum(mean_of_instants(scene, surfaces, at, ray) for ray in pixel_rays(rays_per_pixel)) / rays_per_pixel
+    once = torch.full((1, 1), 1 / rays_per_pixel, dtype=torch.float64, device=device)
+    meshes_only = sum(sum_of_instants(scene, surfaces, at, once, ray) for ray in pixel_rays(rays_per_pixel))
     n_pixels = camera.height * camera.width
     face = torch.full((n_pixels,), -1, dtype=torch.int64, device=device)
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
@@ -83,7 +84,7 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     to_open, to_close = (_displacement_px(scene, (mesh_id, face_id, bary), s) for s in (0.0, 1.0))
     dtype = scene.dtype
     return Instant(
-        rgba=rgba.to(dtype),
+        rgba=scene.over_background(meshes_only).to(dtype),
         depth_view=depth.reshape(shape).to(dtype),
         motion_px=(to_close - to_open).to(dtype),
         motion_to_open_px=to_open.to(dtype),
@@ -151,8 +152,18 @@ def _displacement_px(scene: Scene, visible: tuple[Tensor, Tensor, Tensor], t: fl
     return out
 
 
-def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[float, float]) -> Tensor:
-    """Return (H, W, 4) float64, the mean over the instants `t` (B,) of the image through one ray per pixel. Ours."""
+def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor, ray_px: tuple[float, float]) -> Tensor:
+    """Return (H, W, 4) float64, the weighted sum of the meshes' premultiplied colour and opacity at the instants.
+
+    Args:
+        scene: what to look at.
+        surfaces: of its faces.
+        t: (B,) shutter times.
+        weight: (B, H * W) or (B, 1).
+        ray_px: place of the ray inside each pixel.
+
+    Source: ours.
+    """
     camera = scene.camera
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
@@ -161,7 +172,5 @@ def mean_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[
         before, after = packed.transmittance(alpha, fragments.offsets)
         light = (before * alpha).unsqueeze(1) * surfaces.rgb[fragments.face]
         rgba = torch.cat([packed.sum_by_owner(light, fragments.offsets), (1 - after).unsqueeze(1)], dim=1)
-        total = total + rgba.reshape(-1, n_pixels, 4).sum(0)
-    image = (total / len(t)).reshape(camera.height, camera.width, 4)
-    alpha = image[..., 3:]
-    return torch.cat([image[..., :3] + (1 - alpha) * scene.background.to(image), alpha], dim=-1)
+        total = total + (rgba.reshape(-1, n_pixels, 4) * weight.unsqueeze(2)).sum(0)
+    return total.reshape(camera.height, camera.width, 4)

@@ -1,6 +1,6 @@
 """Find, for every ray of a block of pixels, the slices of time in which each prism covers it.
 
-Before: prisms.py, edges.py.  After: cells.py.
+Before: pairs.py, edges.py.  After: cells.py.
 Symbols: P prisms, n pairs of prism and pixel, N intervals; t shutter time; u local time of a prism, 0 at its open end.
 Nearness = M / D orders surfaces along the ray, larger in front: 1 / w or 2 - z / w, see `Camera.orders_by_w`; M and D
 are cubics in time, kept by their Bernstein coefficients over the interval.
@@ -17,46 +17,11 @@ from torch import Tensor
 
 from torchblur import bernstein, edges, packed
 from torchblur.edges import Corners
+from torchblur.pairs import Block, find_pairs
 from torchblur.prisms import Prisms
 
 FIXED = -1  # kind of an interval's end: end of the prism's slice of time
 NEAR, FAR = 3, 4  # 0, 1, 2 are the edges
-
-
-@dataclass(frozen=True)
-class Block:
-    """A rectangle of pixels and the place of the ray inside each."""
-
-    x0: int  # first column [px]
-    y0: int  # first row [px]
-    width: int
-    height: int
-    ray_px: tuple[float, float]  # place of the ray inside its pixel, (0.5, 0.5) is the centre
-    image_width: int
-    image_height: int
-
-    @property
-    def n_pixels(self) -> int:
-        """Number of pixels."""
-        return self.width * self.height
-
-    def ray_ndc(self, pixel: Tensor) -> Tensor:
-        """Return (2, n) float64 NDC of the rays of the block's pixels `pixel` (n,), row by row."""
-        x_px = (self.x0 + pixel % self.width).to(torch.float64) + self.ray_px[0]
-        y_px = (self.y0 + pixel // self.width).to(torch.float64) + self.ray_px[1]
-        return torch.stack([2 * x_px / self.image_width - 1, 1 - 2 * y_px / self.image_height])
-
-    def columns_rows(self, bounds_px: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return the first column, first row, and numbers of columns and rows (P,) of the block whose rays `bounds_px`
-        (4, P) hold.
-        """
-        low_x = torch.ceil(bounds_px[0].clamp(min=-1) - self.ray_px[0]).clamp(min=self.x0)
-        low_y = torch.ceil(bounds_px[1].clamp(min=-1) - self.ray_px[1]).clamp(min=self.y0)
-        high_x = torch.floor(bounds_px[2].clamp(max=self.image_width) - self.ray_px[0])
-        high_y = torch.floor(bounds_px[3].clamp(max=self.image_height) - self.ray_px[1])
-        n_x = (high_x.clamp(max=self.x0 + self.width - 1) - low_x + 1).clamp(min=0)
-        n_y = (high_y.clamp(max=self.y0 + self.height - 1) - low_y + 1).clamp(min=0)
-        return low_x.long(), low_y.long(), n_x.long(), n_y.long()
 
 
 @dataclass(frozen=True)
@@ -90,12 +55,6 @@ class Intervals:
         )
 
 
-def count_pairs(prisms: Prisms, block: Block, candidates: Tensor) -> Tensor:
-    """Return (C,) the number of pixels of `block` inside the bounds of each of the `candidates` (C,)."""
-    _, _, n_x, n_y = block.columns_rows(prisms.bounds_px[:, candidates])
-    return n_x * n_y
-
-
 def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[Intervals, int]:
     """Return the intervals of all rays of `block`, and the number of pairs of prism and ray that were looked at.
 
@@ -113,13 +72,8 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
     Source: Ronnow et al. 2021, sec. 4.1, repaired: coverage by signs, not by pairing hits.
     """
     with torch.no_grad():
-        low_x, low_y, n_x, n_y = block.columns_rows(prisms.bounds_px[:, candidates])
-        local, pair_of = packed.expand(torch.zeros_like(n_x), n_x * n_y)
-        n_pairs = len(local)
-        column = low_x[pair_of] + local % n_x[pair_of]
-        row = low_y[pair_of] + local // n_x[pair_of]
-        pixel = (row - block.y0) * block.width + (column - block.x0)
-        prism = candidates[pair_of]
+        prism, pixel = find_pairs(prisms, block, candidates)
+        n_pairs = len(prism)
         corners = edges.reduce_corners(prisms.clip, prism, block.ray_ndc(pixel))
         keep = _may_cover(prisms, prism, corners).nonzero().flatten()
         prism, pixel, corners = prism[keep], pixel[keep], corners[keep]

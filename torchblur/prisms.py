@@ -16,11 +16,10 @@ import torch
 from torch import Tensor
 
 from torchblur.scene import Mesh, Scene
-from torchblur.shutter import Shutter
 from torchblur.surfaces import Surfaces
 
 OPEN_CORNERS = ((0, 0), (0, 1), (0, 2), (1, 0), (1, 1), (1, 2))  # (end of the prism, corner)
-SAME_KNOT = 1e-12  # shutter time; knots of a mesh, the camera and the shutter closer than this are one
+SAME_KNOT = 1e-12  # of the window; knots of a mesh, the camera and the shutter closer than this are one
 BOUND_SLACK_PX = 1e-6  # widening of the bounds against rounding; far above float64 error, far below a pixel
 
 
@@ -32,12 +31,13 @@ class Prisms:
     t_open: Tensor  # (P,) float64 shutter time at which the prism's slice begins
     t_close: Tensor  # (P,) float64 and ends
     face_of: Tensor  # (P,) int64 face of the scene (all meshes end to end)
-    corner_of: Tensor  # (3, P) int64 which corner of the face is stored at each place
     parity: Tensor  # (P,) float64, +1 where the stored corners turn as the face's do, else -1
     is_clipped: Tensor  # (P,) bool: reaches beyond the near or the far plane
     bounds_px: Tensor  # (4, P) float64 x0 y0 x1 y1 of the swept area on screen [px], conservative
+    corners_px: Tensor  # (2, 6, P) float64 x, y of the corners on screen [px]; NaN where one is behind the near plane
     surfaces: Surfaces  # what the faces look like
     orders_by_w: bool  # depth order by 1 / w, else by z / w
+    window: tuple[float, float]  # shutter times between which the prisms lie
 
     @property
     def count(self) -> int:
@@ -45,13 +45,13 @@ class Prisms:
         return len(self.face_of)
 
 
-def build_prisms(scene: Scene, surfaces: Surfaces, shutter: Shutter) -> Prisms:
-    """Return the prisms of all faces that can be seen while the shutter is open.
+def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) -> Prisms:
+    """Return the prisms of all faces that can be seen in a window of time.
 
     Args:
         scene: meshes and camera; their motions may have different numbers of knots.
         surfaces: of the same scene.
-        shutter: prisms are cut to its window.
+        window: shutter times to which the prisms are cut.
 
     Returns:
         Prisms. Left out are only faces of opacity 0 (when opacity asks for no gradient) and prisms that lie
@@ -60,76 +60,86 @@ def build_prisms(scene: Scene, surfaces: Surfaces, shutter: Shutter) -> Prisms:
     Source: Ronnow et al. 2021, sec. 3; segments ours.
     """
     camera = scene.camera
-    parts: list[tuple[Tensor, ...]] = []
+    parts: list[tuple[Tensor, ...]] = [_no_prisms(scene.device)]
     for i, mesh in enumerate(scene.meshes):
         if mesh.n_faces == 0:
             continue
-        times = window_times(scene, mesh, shutter)
-        is_static = mesh.n_segments == camera.n_segments == 0
-        at = torch.tensor(times[:1] if is_static else times, dtype=torch.float64, device=scene.device)
-        clip_vertices = scene.clip_at(mesh, at)
-        clip = clip_vertices[:, mesh.faces]  # (knots, F, 3, 4)
-        clip_open, clip_close = (clip, clip) if is_static else (clip[:-1], clip[1:])
-        n_segments = len(clip_open)
-        both = torch.stack([clip_open, clip_close]).flatten(1, 2).permute(0, 2, 3, 1)  # (2, 3, 4, segments * F)
-        span = torch.tensor(times, dtype=torch.float64, device=scene.device)
+        times = window_times(scene, mesh, window)
         face = torch.arange(mesh.n_faces, device=scene.device) + surfaces.first_face[i]
-        parts.append(
-            (
-                both,
-                span[:-1].repeat_interleave(mesh.n_faces),
-                span[1:].repeat_interleave(mesh.n_faces),
-                face.repeat(n_segments),
-            )
-        )
-    if not parts:
-        return _assemble(scene, surfaces, *_no_prisms(scene.device))
-    return _assemble(scene, surfaces, *(torch.cat(p, dim=-1) for p in zip(*parts, strict=True)))
+        if not surfaces.opacity.requires_grad:
+            face = face[surfaces.opacity[face] > 0]
+        corners = mesh.faces[face - surfaces.first_face[i]]
+        at = torch.tensor(times, dtype=torch.float64, device=scene.device)
+        clip_vertices = scene.clip_at(mesh, at)
+        is_static = mesh.n_segments == camera.n_segments == 0
+        for k in range(len(times) - 1):
+            clip_open = clip_vertices[k, corners].permute(1, 2, 0)  # (3, 4, F)
+            clip_close = clip_open if is_static else clip_vertices[k + 1, corners].permute(1, 2, 0)
+            parts.append(_seen(scene, torch.stack([clip_open, clip_close]), (times[k], times[k + 1]), face))
+    clip, t_open, t_close, face_of, parity, is_clipped, bounds, corners_px = (
+        torch.cat(p, dim=-1) for p in zip(*parts, strict=True)
+    )
+    return Prisms(
+        clip=clip,
+        t_open=t_open,
+        t_close=t_close,
+        face_of=face_of,
+        parity=parity,
+        is_clipped=is_clipped,
+        bounds_px=bounds,
+        corners_px=corners_px,
+        surfaces=surfaces,
+        orders_by_w=camera.orders_by_w,
+        window=window,
+    )
 
 
-def window_times(scene: Scene, mesh: Mesh, shutter: Shutter) -> list[float]:
-    """Return the ends of the shutter's window and the knots of a mesh's motion between them."""
-    times = [shutter.t_open]
+def window_times(scene: Scene, mesh: Mesh, window: tuple[float, float]) -> list[float]:
+    """Return the ends of a window of shutter time and the knots of a mesh's motion between them."""
+    times = [window[0]]
+    least = SAME_KNOT * (window[1] - window[0])
     for t in scene.knot_times(mesh):
-        if t - times[-1] > SAME_KNOT and shutter.t_close - t > SAME_KNOT:
+        if t - times[-1] > least and window[1] - t > least:
             times.append(t)
-    return [*times, shutter.t_close]
+    return [*times, window[1]]
 
 
-def _no_prisms(device: torch.device) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _no_prisms(device: torch.device) -> tuple[Tensor, ...]:
+    """Return the fields of no prisms, in the order of `_seen`."""
     empty = torch.zeros(0, dtype=torch.float64, device=device)
-    return empty.reshape(2, 3, 4, 0), empty, empty, torch.zeros(0, dtype=torch.int64, device=device)
+    clip, no_face = empty.reshape(2, 3, 4, 0), empty.long()
+    return clip, empty, empty, no_face, empty, empty.bool(), empty.reshape(4, 0), empty.reshape(2, 6, 0)
 
 
-def _assemble(
-    scene: Scene, surfaces: Surfaces, clip: Tensor, t_open: Tensor, t_close: Tensor, face_of: Tensor
-) -> Prisms:
-    """Put corners in canonical order, bound the swept areas, and drop what can't be seen."""
+def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tensor) -> tuple[Tensor, ...]:
+    """Return the fields of the prisms (2, 3, 4, F) of one slice of time that are not wholly outside the view, with
+    their corners in canonical order.
+    """
+    width, height = scene.camera.width, scene.camera.height
     with torch.no_grad():
         corner_of, parity = canonical_corners(clip)
-        near = clip[:, :, 2] + clip[:, :, 3]  # (2, 3, P): inside where >= 0
+        near = clip[:, :, 2] + clip[:, :, 3]  # (2, 3, F): inside where >= 0
         far = clip[:, :, 3] - clip[:, :, 2]
-        bounds = swept_bounds_px(clip, near, scene.camera.width, scene.camera.height)
+        bounds = swept_bounds_px(clip, near, width, height)
         outside = (near < 0).all(0).all(0) | (far < 0).all(0).all(0)
-        outside |= (bounds[0] > scene.camera.width) | (bounds[1] > scene.camera.height)
-        outside |= (bounds[2] < 0) | (bounds[3] < 0)
-        if not surfaces.opacity.requires_grad:
-            outside |= surfaces.opacity[face_of] == 0
-        kept = (~outside).nonzero().flatten()
+        outside |= (bounds[0] > width) | (bounds[1] > height) | (bounds[2] < 0) | (bounds[3] < 0)
         is_clipped = ((near < 0) | (far < 0)).any(0).any(0)
-    corner_of, parity = corner_of[:, kept], parity[kept]
-    index = corner_of.reshape(1, 3, 1, -1).expand(2, 3, 4, -1)
-    return Prisms(
-        clip=clip[..., kept].gather(1, index),
-        t_open=t_open[kept],
-        t_close=t_close[kept],
-        face_of=face_of[kept],
-        corner_of=corner_of,
-        parity=parity,
-        is_clipped=is_clipped[kept],
-        bounds_px=bounds[:, kept],
-        surfaces=surfaces,
-        orders_by_w=scene.camera.orders_by_w,
+        kept = (~outside).nonzero().flatten()
+        has_hull = ((near >= 0) & (clip[:, :, 3] > 0)).all(0).all(0)
+        w = torch.where(has_hull, clip[:, :, 3], 1.0)
+        x_px, y_px = (clip[:, :, 0] / w + 1) * (width / 2), (1 - clip[:, :, 1] / w) * (height / 2)
+        corners_px = torch.where(has_hull, torch.stack([x_px, y_px]).flatten(1, 2), torch.nan)
+    order = corner_of[:, kept].reshape(1, 3, 1, -1).expand(2, 3, 4, -1)
+    one = torch.ones(len(kept), dtype=torch.float64, device=clip.device)
+    return (
+        clip[..., kept].gather(1, order),
+        times[0] * one,
+        times[1] * one,
+        face_of[kept],
+        parity[kept],
+        is_clipped[kept],
+        bounds[:, kept],
+        corners_px[..., kept],
     )
 
 

@@ -7,25 +7,26 @@ Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
 
-from torchblur import check
+from torchblur import check, packed
 from torchblur.accuracy import Accuracy
 from torchblur.camera import pixel_rays
 from torchblur.cells import count_layers, cut_cells
-from torchblur.intervals import Block, Intervals, count_pairs, find_intervals
+from torchblur.intervals import Intervals, find_intervals
+from torchblur.pairs import Block, count_pairs
 from torchblur.prisms import Prisms, build_prisms
-from torchblur.resolve import Resolved, resolve_cells
+from torchblur.resolve import composite_cells, expose_cells
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
 
-BYTES_PER_PAIR = 700  # peak of find_intervals, measured by scripts/benchmark_memory.py
+BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 BYTES_PER_LAYER = 260  # peak of cut_cells and resolve_cells
 MIN_MEMORY_BYTES = 1 << 20
 MAX_RAYS = 4096
@@ -73,7 +74,7 @@ def render(
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
 ) -> Frame:
-    """Return the mean of `scene` over the shutter's window, exact in time, without samples or noise.
+    """Return the mean of `scene` over its exposure, weighted by the shutter, exact in time, without samples or noise.
 
     Args:
         scene: what to render; the frame has its device, and the floating type of its vertices.
@@ -81,8 +82,9 @@ def render(
         shutter: `Shutter.box()`, the whole exposure, if None.
         rays_per_pixel: 1 looks through the pixel's centre only; more rays, each exact in time, are spread inside the
             pixel and averaged (box filter).
-        memory_bytes: working memory to stay under, by dividing the image into blocks [bytes]. The image itself comes
-            on top, with gradients autograd keeps every block, and a single ray that needs more gets it.
+        memory_bytes: working memory to stay under, by dividing the image into blocks [bytes]. The image and the prisms
+            (0.4 kB a face and piece of motion) come on top, with gradients autograd keeps every block, and a single ray
+            that needs more gets it.
 
     Returns:
         A frame with `rgba` (H, W, 4), `coverage` (H, W, M), counts and timings.
@@ -100,54 +102,107 @@ def render(
         >>> float(render(Scene([], camera, background=(0.25, 0, 0))).rgba[0, 0, 0])
         0.25
     """
+    shutters = (Shutter.box() if shutter is None else shutter,)
+    job = _checked_job(scene, shutters, accuracy, rays_per_pixel, memory_bytes)
+    return job.frames(rays_per_pixel)[0]
+
+
+def render_windows(
+    scene: Scene,
+    windows: Sequence[tuple[float, float]],
+    *,
+    accuracy: Accuracy | None = None,
+    shutter: Shutter | None = None,
+    rays_per_pixel: int = 1,
+    memory_bytes: int = 1 << 28,
+) -> tuple[Frame, ...]:
+    """Return a frame for each part of the exposure, all from one set of intervals, which is found only once.
+
+    Args:
+        scene: what to render.
+        windows: parts (start, end) of the exposure [shutter time]; they may overlap.
+        shutter: whose weight applies inside each window, with unit integral; `Shutter.box()` if None.
+        accuracy, rays_per_pixel, memory_bytes: as in `render`.
+
+    Returns:
+        One frame a window, each what `render` returns for `shutter.window(start, end)`; they share counts and timings.
+
+    Raises:
+        TypeError, ValueError: a wrong argument, named; a window in which the shutter sees nothing.
+
+    Source: ours.
+    """
+    whole = Shutter.box() if shutter is None else shutter
+    if not isinstance(whole, Shutter):
+        raise check.fail_type("shutter", "a Shutter", shutter)
+    if not isinstance(windows, (list, tuple)) or not all(isinstance(w, (list, tuple)) and len(w) == 2 for w in windows):
+        raise check.fail_type("windows", "a sequence of pairs (start, end)", windows)
+    if not windows:
+        raise check.fail("windows", "at least one pair (start, end)", windows)
+    shutters = tuple(whole.window(start, end) for start, end in windows)
+    job = _checked_job(scene, shutters, accuracy, rays_per_pixel, memory_bytes)
+    return tuple(job.frames(rays_per_pixel))
+
+
+def _checked_job(
+    scene: Scene, shutters: tuple[Shutter, ...], accuracy: Accuracy | None, rays_per_pixel: int, memory_bytes: int
+) -> _Job:
+    """Return the job of these arguments, or raise naming the wrong one."""
     if not isinstance(scene, Scene):
         raise check.fail_type("scene", "a Scene", scene)
     accuracy = Accuracy.exact() if accuracy is None else accuracy
-    shutter = Shutter.box() if shutter is None else shutter
     if not isinstance(accuracy, Accuracy):
         raise check.fail_type("accuracy", "an Accuracy", accuracy)
-    if not isinstance(shutter, Shutter):
-        raise check.fail_type("shutter", "a Shutter", shutter)
+    for shutter in shutters:
+        if not isinstance(shutter, Shutter):
+            raise check.fail_type("shutter", "a Shutter", shutter)
+        shutter.span(shutter.n_lines(scene.camera.width, scene.camera.height))
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
     if check.positive_int("memory_bytes", memory_bytes) < MIN_MEMORY_BYTES:
         raise check.fail("memory_bytes", f"at least {MIN_MEMORY_BYTES}", memory_bytes)
-    ledger = _Ledger()
-    with torch.set_grad_enabled(scene.requires_grad):
-        with ledger.stage("prisms", scene.device):
-            surfaces = build_surfaces(scene)
-            prisms = build_prisms(scene, surfaces, shutter)
-        ledger.add("prisms", prisms.count)
-        job = _Job(scene, prisms, accuracy, shutter, memory_bytes, ledger)
-        total = sum(job.image(ray) for ray in pixel_rays(rays_per_pixel)) / rays_per_pixel
-        alpha, coverage = total[..., 3:4], total[..., 4:]
-        rgb = total[..., :3] + (1 - alpha) * scene.background.to(total)
-        rgba = torch.cat([rgb, alpha], dim=-1).to(scene.dtype)
-        for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
-            rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
-    return Frame(rgba, coverage.to(scene.dtype), ledger.counts, ledger.timings)
+    return _Job(scene, shutters, accuracy, memory_bytes, _Ledger())
 
 
 @dataclass(frozen=True)
 class _Job:
-    """One frame to render."""
+    """One scene to render under one or several shutters."""
 
     scene: Scene
-    prisms: Prisms
+    shutters: tuple[Shutter, ...]
     accuracy: Accuracy
-    shutter: Shutter
     memory_bytes: int
     ledger: _Ledger
 
-    def image(self, ray_px: tuple[float, float]) -> Tensor:
-        """Return (H, W, 4 + M) float64: premultiplied colour, alpha and coverage for one ray per pixel."""
-        camera = self.scene.camera
+    def frames(self, rays_per_pixel: int) -> list[Frame]:
+        """Return a frame for each shutter."""
+        scene, ledger = self.scene, self.ledger
+        spans = [s.span(s.n_lines(scene.camera.width, scene.camera.height)) for s in self.shutters]
+        window = min(start for start, _ in spans), max(end for _, end in spans)
+        with torch.set_grad_enabled(scene.requires_grad):
+            with ledger.stage("prisms", scene.device):
+                surfaces = build_surfaces(scene)
+                prisms = build_prisms(scene, surfaces, window)
+            ledger.add("prisms", prisms.count)
+            total = sum(self._image(prisms, ray) for ray in pixel_rays(rays_per_pixel)) / rays_per_pixel
+            return [self._frame(image) for image in total]
+
+    def _frame(self, image: Tensor) -> Frame:
+        """Return the frame of (H, W, 4 + M) premultiplied colour, alpha and coverage."""
+        scene = self.scene
+        rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., 4:]
+        for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
+            rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
+        return Frame(rgba, coverage.to(scene.dtype), self.ledger.counts, self.ledger.timings)
+
+    def _image(self, prisms: Prisms, ray_px: tuple[float, float]) -> Tensor:
+        """Return (shutters, H, W, 4 + M) float64: premultiplied colour, alpha and coverage for one ray per pixel."""
+        camera, device = self.scene.camera, self.scene.device
         whole = Block(0, 0, camera.width, camera.height, ray_px, camera.width, camera.height)
-        every = torch.arange(self.prisms.count, device=self.scene.device)
-        n_channels = 4 + len(self.scene.meshes)
+        every = torch.arange(prisms.count, device=device)
         places, values = [], []
-        for block, candidates in self._blocks(whole, every):
-            with self.ledger.stage("intervals", self.scene.device):
-                intervals, n_pairs = find_intervals(self.prisms, block, candidates)
+        for block, candidates in self._blocks(prisms, whole, every):
+            with self.ledger.stage("intervals", device):
+                intervals, n_pairs = find_intervals(prisms, block, candidates)
             self.ledger.add("blocks", 1)
             self.ledger.add("pairs", n_pairs)
             self.ledger.add("intervals", intervals.count)
@@ -155,28 +210,38 @@ class _Job:
                 continue
             self.ledger.deepest("deepest_pixel", intervals.offsets.diff().max())
             for pixels in self._chunks(intervals):
-                done = self._resolve(intervals.of_pixels(pixels))
-                places.append((block.y0 + pixels // block.width) * camera.width + block.x0 + pixels % block.width)
-                values.append(torch.cat([done.premultiplied, done.alpha.unsqueeze(1), done.coverage], dim=1))
-        image = torch.zeros(camera.height * camera.width, n_channels, dtype=torch.float64, device=self.scene.device)
+                column, row = block.x0 + pixels % block.width, block.y0 + pixels // block.width
+                places.append(row * camera.width + column)
+                values.append(self._resolve(prisms, intervals.of_pixels(pixels), (column, row)))
+        n_pixels, n_channels = camera.height * camera.width, 4 + len(self.scene.meshes)
+        image = torch.zeros(n_pixels, len(self.shutters), n_channels, dtype=torch.float64, device=device)
         if places:
             image = image.index_put((torch.cat(places),), torch.cat(values))
-        return image.reshape(camera.height, camera.width, n_channels)
+        return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
 
-    def _resolve(self, intervals: Intervals) -> Resolved:
-        with self.ledger.stage("cells", self.scene.device):
-            cells = cut_cells(self.prisms, intervals)
+    def _resolve(self, prisms: Prisms, intervals: Intervals, pixel: tuple[Tensor, Tensor]) -> Tensor:
+        """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`."""
+        camera, device = self.scene.camera, self.scene.device
+        with self.ledger.stage("cells", device):
+            cells = cut_cells(prisms, intervals)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
         self.ledger.add("crossings", cells.n_crossings)
-        with self.ledger.stage("resolve", self.scene.device):
-            face = self.prisms.face_of[intervals.prism]
-            cutoff = self.accuracy.transmittance_cutoff
-            return resolve_cells(self.prisms.surfaces, face, cells, self.shutter, cutoff)
+        with self.ledger.stage("resolve", device):
+            face = prisms.face_of[intervals.prism]
+            composite = composite_cells(prisms.surfaces, face, cells, self.accuracy.transmittance_cutoff)
+            pixel_of_cell = packed.owners(cells.offsets)
+            parts = []
+            for shutter in self.shutters:
+                line = shutter.line_of(*pixel, (camera.width, camera.height))[pixel_of_cell]
+                weight = shutter.weight(cells.t_start, cells.t_end, line)
+                done = expose_cells(cells, composite, weight, len(self.scene.meshes))
+                parts.append(torch.cat([done.premultiplied, done.alpha.unsqueeze(1), done.coverage], dim=1))
+            return torch.stack(parts, dim=1)
 
-    def _blocks(self, block: Block, candidates: Tensor) -> Iterator[tuple[Block, Tensor]]:
+    def _blocks(self, prisms: Prisms, block: Block, candidates: Tensor) -> Iterator[tuple[Block, Tensor]]:
         """Yield blocks whose pairs fit the memory, each with the prisms that may touch it; empty ones left out."""
-        counts = count_pairs(self.prisms, block, candidates)
+        counts = count_pairs(prisms, block, candidates)
         candidates = candidates[counts > 0]
         total = int(counts.sum())
         if total == 0:
@@ -191,7 +256,7 @@ class _Job:
             half = block.height // 2
             parts = replace(block, height=half), replace(block, y0=block.y0 + half, height=block.height - half)
         for part in parts:
-            yield from self._blocks(part, candidates)
+            yield from self._blocks(prisms, part, candidates)
 
     def _chunks(self, intervals: Intervals) -> Iterator[Tensor]:
         """Yield runs of covered pixels whose layers fit the memory."""

@@ -1,7 +1,8 @@
 """Composite each cell front to back and add the cells up over the exposure.
 
 Before: cells.py.  After: render.py.
-Symbols: C cells, L layers, M meshes. Colour is linear, straight in a layer, premultiplied once composited.
+Symbols: C cells, L layers, M meshes, S pairs of a cell and a mesh visible in it. Colour is linear, straight in a
+layer, premultiplied once composited.
 Source: Ronnow et al. 2021, alg. 1 (resolve).
 """
 
@@ -14,8 +15,16 @@ from torch import Tensor
 
 from torchblur import packed
 from torchblur.cells import Cells
-from torchblur.shutter import Shutter
 from torchblur.surfaces import Surfaces
+
+
+@dataclass(frozen=True)
+class Composite:
+    """What each cell shows, however long it is seen."""
+
+    rgba: Tensor  # (C, 4) float64 premultiplied linear colour and opacity of the meshes
+    seen_cell: Tensor  # (S,) int64 cells, once for each mesh that is visible in them
+    seen_mesh: Tensor  # (S,) int64
 
 
 @dataclass(frozen=True)
@@ -27,42 +36,45 @@ class Resolved:
     coverage: Tensor  # (pixels, M) float64 share of the exposure in which each mesh is visible
 
 
-def resolve_cells(
-    surfaces: Surfaces, face_of_interval: Tensor, cells: Cells, shutter: Shutter, cutoff: float
-) -> Resolved:
-    """Return colour, alpha and coverage of every pixel.
+def composite_cells(surfaces: Surfaces, face_of_interval: Tensor, cells: Cells, cutoff: float) -> Composite:
+    """Return what every cell shows, front to back.
 
     Args:
         surfaces: appearance of the faces.
         face_of_interval: (N,) int64 of the intervals the cells were cut from.
         cells: with layers nearest first.
-        shutter: weight of a cell.
         cutoff: transmittance at which a ray ends; see `packed.transmittance`.
 
     Accuracy: exact for flat colour and opacity; with a cut-off, see `Accuracy`.
-    Gradient: to colour, opacity, and through the cells' times.
+    Gradient: to colour and opacity.
     Source: Ronnow et al. 2021, alg. 1.
     """
     face = face_of_interval[cells.layer_interval]
     alpha = surfaces.opacity[face]
     before, after = packed.transmittance(alpha, cells.layer_offsets, cutoff)
-    weight = shutter.weight(cells.t_start, cells.t_end)
     layer_rgb = (before * alpha).unsqueeze(1) * surfaces.rgb[face]
-    cell_rgba = torch.cat([packed.sum_by_owner(layer_rgb, cells.layer_offsets), (1 - after).unsqueeze(1)], dim=1)
-    rgba = packed.sum_by_owner(weight.unsqueeze(1) * cell_rgba, cells.offsets)
-    n_meshes = len(surfaces.first_face)
+    rgba = torch.cat([packed.sum_by_owner(layer_rgb, cells.layer_offsets), (1 - after).unsqueeze(1)], dim=1)
+    n_meshes = max(1, len(surfaces.first_face))
     visible = ((before.detach() > 0) & (alpha.detach() > 0)).nonzero().flatten()
-    coverage = _coverage(cells, weight, (visible, surfaces.mesh_of[face[visible]]), n_meshes)
-    return Resolved(rgba[:, :3], rgba[:, 3], coverage)
+    cell = packed.owners(cells.layer_offsets)[visible]
+    seen = torch.unique(cell * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once a cell
+    return Composite(rgba, seen // n_meshes, seen % n_meshes)
 
 
-def _coverage(cells: Cells, weight: Tensor, visible: tuple[Tensor, Tensor], n_meshes: int) -> Tensor:
-    """Return (pixels, M) the time in which at least one visible layer belongs to each mesh."""
-    layer, mesh = visible
+def expose_cells(cells: Cells, composite: Composite, weight: Tensor, n_meshes: int) -> Resolved:
+    """Return the mean of the cells of each pixel under a shutter.
+
+    Args:
+        cells: in time order.
+        composite: of the same cells.
+        weight: (C,) of each cell, from the shutter.
+        n_meshes: M.
+
+    Gradient: through the composite, and to the cells' times through the weight.
+    Source: the rendering integral of Ronnow et al. 2021, sec. 3.
+    """
+    rgba = packed.sum_by_owner(weight.unsqueeze(1) * composite.rgba, cells.offsets)
     n_pixels = len(cells.offsets) - 1
-    cell_of_layer = packed.owners(cells.layer_offsets)[layer]
-    key = torch.unique(cell_of_layer * n_meshes + mesh)
-    cell = key // max(n_meshes, 1)
-    target = packed.owners(cells.offsets)[cell] * n_meshes + key % max(n_meshes, 1)
-    total = weight.new_zeros(n_pixels * n_meshes).index_add(0, target, weight[cell])
-    return total.reshape(n_pixels, n_meshes)
+    target = packed.owners(cells.offsets)[composite.seen_cell] * n_meshes + composite.seen_mesh
+    coverage = weight.new_zeros(n_pixels * n_meshes).index_add(0, target, weight[composite.seen_cell])
+    return Resolved(rgba[:, :3], rgba[:, 3], coverage.reshape(n_pixels, n_meshes))

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchblur import check
 from torchblur.camera import pixel_rays
-from torchblur.instant import MAX_RAYS, mean_of_instants
+from torchblur.instant import MAX_RAYS, sum_of_instants
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
@@ -34,12 +34,12 @@ class Accumulated:
 def accumulate(
     scene: Scene, times: int = 4096, *, shutter: Shutter | None = None, rays_per_pixel: int = 1
 ) -> Accumulated:
-    """Return the mean of `times` sharp images at the midpoints of equal parts of the shutter's window.
+    """Return the mean of `times` sharp images at the midpoints of equal parts of the time the shutter is open.
 
     Args:
         scene: what to render.
         times: number of instants N.
-        shutter: whole exposure if None.
+        shutter: weighs the parts; `Shutter.box()`, the whole exposure, if None.
         rays_per_pixel: as in `render`.
 
     Returns:
@@ -59,14 +59,20 @@ def accumulate(
     if not isinstance(shutter, Shutter):
         raise check.fail_type("shutter", "a Shutter", shutter)
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
+    camera = scene.camera
+    n_lines = shutter.n_lines(camera.width, camera.height)
+    start, end = shutter.span(n_lines)
     surfaces = build_surfaces(scene)
-    middle = (torch.arange(times, dtype=torch.float64, device=scene.device) + 0.5) / times
-    t = shutter.t_open + (shutter.t_close - shutter.t_open) * middle
-    n_pixels, n_faces = scene.camera.width * scene.camera.height, max(1, len(surfaces.opacity))
-    batch = max(1, min(MAX_OWNERS // n_pixels, MAX_TRIANGLES // n_faces))
-    total = sum(
-        mean_of_instants(scene, surfaces, part, ray) * len(part)
-        for ray in pixel_rays(rays_per_pixel)
-        for part in torch.split(t, batch)
-    )
-    return Accumulated((total / (times * rays_per_pixel)).to(scene.dtype), times)
+    ends = start + (end - start) * torch.arange(times + 1, dtype=torch.float64, device=scene.device) / times
+    pixel = torch.arange(camera.width * camera.height, device=scene.device)
+    line = shutter.line_of(pixel % camera.width, pixel // camera.width, (camera.width, camera.height))
+    line = line if shutter.line_delay else line[:1]  # one weight serves all
+    n_faces = max(1, len(surfaces.opacity))
+    batch = max(1, min(MAX_OWNERS // len(pixel), MAX_TRIANGLES // n_faces))
+    total = 0
+    for part in torch.arange(times, device=scene.device).split(batch):
+        early, late = ends[part].unsqueeze(1), ends[part + 1].unsqueeze(1)
+        weight = shutter.weight(early, late, line) / rays_per_pixel
+        for ray in pixel_rays(rays_per_pixel):
+            total = total + sum_of_instants(scene, surfaces, 0.5 * (early + late).flatten(), weight, ray)
+    return Accumulated(scene.over_background(total).to(scene.dtype), times)

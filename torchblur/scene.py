@@ -185,6 +185,12 @@ class Scene:
         share = ((t - knots[segment]) / (knots[segment + 1] - knots[segment])).reshape(-1, 1, 1)
         return (1 - share) * clip[segment] + share * clip[segment + 1]
 
+    def over_background(self, premultiplied: Tensor) -> Tensor:
+        """Return (H, W, 4) colour with the background behind it, and opacity, of (H, W, 4) premultiplied. Ours."""
+        alpha = premultiplied[..., 3:]
+        rgb = premultiplied[..., :3] + (1 - alpha) * self.background.to(premultiplied)
+        return torch.cat([rgb, alpha], dim=-1)
+
     def tensors(self) -> list[Tensor]:
         """Return all floating tensors of the scene."""
         parts = [self.camera.world_to_clip, self.background]

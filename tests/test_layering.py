@@ -36,6 +36,7 @@ TORCHBLUR = [
     "cells",
     "texture",
     "shading",
+    "nodes",
     "shadows",
     "resolve",
     "fragments",

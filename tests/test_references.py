@@ -16,7 +16,7 @@ import torch
 import torchblur as tb
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "references"
-NEEDS = {"plank": "textures", "shadow_floor": "lights and shadows"}
+NEEDS = {"shadow_floor": "lights and shadows"}
 
 
 def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
@@ -25,8 +25,13 @@ def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
     with np.load(folder / "scene.npz", allow_pickle=False) as z:
         s = {k: z[k] for k in z.files}
     vertices = torch.as_tensor(np.stack([s["verts0"], s["verts1"]])).to(dtype)
-    material = tb.Material(torch.as_tensor(s["face_color"]), torch.as_tensor(s["face_opacity"]))
-    mesh = tb.Mesh(vertices, torch.as_tensor(s["faces"]), material)
+    texture, uv = None, None
+    if s["face_textured"].any():
+        assert s["face_textured"].all(), "part of the faces textured: needs two meshes"
+        texture = np.load(folder / "texture.npy", allow_pickle=False)[::-1]  # stored with row 0 at v = 0
+        uv = torch.as_tensor(s["uv"])
+    color, opacity = torch.as_tensor(s["face_color"]), torch.as_tensor(s["face_opacity"])
+    mesh = tb.Mesh(vertices, torch.as_tensor(s["faces"]), tb.Material(color, opacity, True, texture, "clamp"), uv=uv)
     camera = tb.Camera(torch.as_tensor(s["world_to_clip"]), int(s["width"]), int(s["height"]))
     scene = tb.Scene([mesh], camera, torch.as_tensor(s["background"]))
     with exr.File(str(folder / "ref.exr")) as file:

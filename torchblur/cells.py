@@ -127,8 +127,7 @@ def _stack_layers(prisms: Prisms, intervals: Intervals, crossings: Crossings | N
 
         is_last = torch.ones_like(cell, dtype=torch.bool)
         is_last[:-1] = cell[1:] != cell[:-1]
-        opacity = prisms.surfaces.opacity
-        ends = is_last if opacity.requires_grad else is_last | (opacity[face] == 1)[interval]
+        ends = is_last | prisms.surfaces.is_opaque[face][interval]
         place = torch.where(ends, torch.arange(len(cell), device=cell.device), len(cell))
         last_seen = torch.full_like(instant_pixel, len(cell)).scatter_reduce(0, cell, place, "amin")[cell]
     return _Layers(cell, interval, last_seen, instant_t, instant_pixel)

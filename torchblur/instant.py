@@ -14,9 +14,11 @@ from torch import Tensor
 
 from torchblur import check, packed
 from torchblur.camera import clip_to_px, pixel_rays
-from torchblur.fragments import find_fragments
+from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
+from torchblur.shading import look
 from torchblur.surfaces import Surfaces, build_surfaces
+from torchblur.texture import to_texels
 
 MAX_RAYS = 4096
 
@@ -69,7 +71,8 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
     for fragments in find_fragments(scene, surfaces, at, (0.5, 0.5)):
-        seen = (surfaces.opacity.detach()[fragments.face] > 0).nonzero().flatten()
+        _, alpha = look(surfaces, fragments.face, _texels(surfaces, fragments))
+        seen = (alpha.detach() > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
         first = seen[packed.offsets_from_counts(count)[:-1]]
         face = face.index_put((owner,), fragments.face[first])
@@ -168,9 +171,17 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
     for fragments in find_fragments(scene, surfaces, t, ray_px):
-        alpha = surfaces.opacity[fragments.face]
+        rgb, alpha = look(surfaces, fragments.face, _texels(surfaces, fragments))
         before, after = packed.transmittance(alpha, fragments.offsets)
-        light = (before * alpha).unsqueeze(1) * surfaces.rgb[fragments.face]
+        light = (before * alpha).unsqueeze(1) * rgb
         rgba = torch.cat([packed.sum_by_owner(light, fragments.offsets), (1 - after).unsqueeze(1)], dim=1)
         total = total + (rgba.reshape(-1, n_pixels, 4) * weight.unsqueeze(2)).sum(0)
     return total.reshape(camera.height, camera.width, 4)
+
+
+def _texels(surfaces: Surfaces, fragments: Fragments) -> Tensor | None:
+    """Return (2, n) places on the textures, None if no face has one."""
+    if not surfaces.is_textured[fragments.face].any():
+        return None
+    uv = torch.einsum("kn,nkc->cn", fragments.bary, surfaces.uv[fragments.face])
+    return to_texels(surfaces, fragments.face, uv)

@@ -31,6 +31,7 @@ class Prisms:
     t_open: Tensor  # (P,) float64 shutter time at which the prism's slice begins
     t_close: Tensor  # (P,) float64 and ends
     face_of: Tensor  # (P,) int64 face of the scene (all meshes end to end)
+    corner_of: Tensor  # (3, P) int64 which corner of the face is stored at each place
     parity: Tensor  # (P,) float64, +1 where the stored corners turn as the face's do, else -1
     is_clipped: Tensor  # (P,) bool: reaches beyond the near or the far plane
     bounds_px: Tensor  # (4, P) float64 x0 y0 x1 y1 of the swept area on screen [px], conservative
@@ -76,7 +77,7 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
             clip_open = clip_vertices[k, corners].permute(1, 2, 0)  # (3, 4, F)
             clip_close = clip_open if is_static else clip_vertices[k + 1, corners].permute(1, 2, 0)
             parts.append(_seen(scene, torch.stack([clip_open, clip_close]), (times[k], times[k + 1]), face))
-    clip, t_open, t_close, face_of, parity, is_clipped, bounds, corners_px = (
+    clip, t_open, t_close, face_of, corner_of, parity, is_clipped, bounds, corners_px = (
         torch.cat(p, dim=-1) for p in zip(*parts, strict=True)
     )
     return Prisms(
@@ -84,6 +85,7 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
         t_open=t_open,
         t_close=t_close,
         face_of=face_of,
+        corner_of=corner_of,
         parity=parity,
         is_clipped=is_clipped,
         bounds_px=bounds,
@@ -108,7 +110,8 @@ def _no_prisms(device: torch.device) -> tuple[Tensor, ...]:
     """Return the fields of no prisms, in the order of `_seen`."""
     empty = torch.zeros(0, dtype=torch.float64, device=device)
     clip, no_face = empty.reshape(2, 3, 4, 0), empty.long()
-    return clip, empty, empty, no_face, empty, empty.bool(), empty.reshape(4, 0), empty.reshape(2, 6, 0)
+    faces = no_face, no_face.reshape(3, 0), empty, empty.bool()
+    return clip, empty, empty, *faces, empty.reshape(4, 0), empty.reshape(2, 6, 0)
 
 
 def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tensor) -> tuple[Tensor, ...]:
@@ -136,6 +139,7 @@ def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tenso
         times[0] * one,
         times[1] * one,
         face_of[kept],
+        corner_of[:, kept],
         parity[kept],
         is_clipped[kept],
         bounds[:, kept],

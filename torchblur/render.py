@@ -19,18 +19,20 @@ from torchblur.accuracy import Accuracy
 from torchblur.camera import pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
+from torchblur.nodes import count_nodes, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.prisms import Prisms, build_prisms
-from torchblur.resolve import composite_cells, expose_cells
+from torchblur.resolve import composite_samples, expose_samples, weigh_samples
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 BYTES_PER_LAYER = 260  # peak of cut_cells and resolve_cells
+BYTES_PER_NODE = 500  # peak of place_samples and composite_samples, a layer
 MIN_MEMORY_BYTES = 1 << 20
 MAX_RAYS = 4096
-COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "deepest_pixel")
+COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "nodes", "deepest_pixel")
 STAGES = ("prisms", "intervals", "cells", "resolve")
 
 
@@ -224,20 +226,37 @@ class _Job:
         camera, device = self.scene.camera, self.scene.device
         with self.ledger.stage("cells", device):
             cells = cut_cells(prisms, intervals)
+            nodes = count_nodes(prisms, intervals, cells)
+        if nodes * BYTES_PER_NODE > self.memory_bytes and len(pixel[0]) > 1:
+            half = len(pixel[0]) // 2
+            parts = []
+            for chosen in torch.arange(len(pixel[0]), device=device).split([half, len(pixel[0]) - half]):
+                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), tuple(p[chosen] for p in pixel)))
+            return torch.cat(parts)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
         self.ledger.add("crossings", cells.n_crossings)
+        column, row = pixel
+        lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("resolve", device):
-            face = prisms.face_of[intervals.prism]
-            composite = composite_cells(prisms.surfaces, face, cells, self.accuracy.transmittance_cutoff)
-            pixel_of_cell = packed.owners(cells.offsets)
+            samples = place_samples(prisms, intervals, cells, self._knots(lines))
+            self.ledger.add("nodes", len(samples.cell))
+            pixel_of = packed.owners(cells.offsets)[samples.cell]
+            offsets = packed.offsets_from_owners(pixel_of, len(column))
+            cutoff = self.accuracy.transmittance_cutoff
+            composite = composite_samples(prisms, intervals, cells, samples, cutoff)
             parts = []
-            for shutter in self.shutters:
-                line = shutter.line_of(*pixel, (camera.width, camera.height))[pixel_of_cell]
-                weight = shutter.weight(cells.t_start, cells.t_end, line)
-                done = expose_cells(cells, composite, weight, len(self.scene.meshes))
+            for shutter, line in zip(self.shutters, lines, strict=True):
+                weight = weigh_samples(shutter, cells, samples, line[pixel_of])
+                done = expose_samples(offsets, composite, weight, len(self.scene.meshes))
                 parts.append(torch.cat([done.premultiplied, done.alpha.unsqueeze(1), done.coverage], dim=1))
             return torch.stack(parts, dim=1)
+
+    def _knots(self, lines: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the times (J,) at which the shutters bend, and by how much lines delay them (J, pixels)."""
+        times = [t for s in self.shutters for t in s.times]
+        delays = [s.line_delay * lines[k].to(torch.float64) for k, s in enumerate(self.shutters) for _ in s.times]
+        return torch.tensor(times, dtype=torch.float64, device=self.scene.device), torch.stack(delays)
 
     def _blocks(self, prisms: Prisms, block: Block, candidates: Tensor) -> Iterator[tuple[Block, Tensor]]:
         """Yield blocks whose pairs fit the memory, each with the prisms that may touch it; empty ones left out."""

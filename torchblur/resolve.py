@@ -1,8 +1,8 @@
-"""Composite each cell front to back and add the cells up over the exposure.
+"""Composite each sample front to back and add the samples up over the exposure.
 
-Before: cells.py.  After: render.py.
-Symbols: C cells, L layers, M meshes, S pairs of a cell and a mesh visible in it. Colour is linear, straight in a
-layer, premultiplied once composited.
+Before: nodes.py.  After: render.py.
+Symbols: S samples, L layers in them, M meshes, V pairs of a sample and a mesh visible in it. Colour is linear, straight
+in a layer, premultiplied once composited.
 Source: Ronnow et al. 2021, alg. 1 (resolve).
 """
 
@@ -15,16 +15,20 @@ from torch import Tensor
 
 from torchblur import packed
 from torchblur.cells import Cells
-from torchblur.surfaces import Surfaces
+from torchblur.intervals import Intervals
+from torchblur.nodes import Samples
+from torchblur.prisms import Prisms
+from torchblur.shading import look, texels_on_prisms
+from torchblur.shutter import Shutter
 
 
 @dataclass(frozen=True)
 class Composite:
-    """What each cell shows, however long it is seen."""
+    """What each sample shows, however long it is seen."""
 
-    rgba: Tensor  # (C, 4) float64 premultiplied linear colour and opacity of the meshes
-    seen_cell: Tensor  # (S,) int64 cells, once for each mesh that is visible in them
-    seen_mesh: Tensor  # (S,) int64
+    rgba: Tensor  # (S, 4) float64 premultiplied linear colour and opacity of the meshes
+    seen_sample: Tensor  # (V,) int64 samples, once for each mesh that is visible in them
+    seen_mesh: Tensor  # (V,) int64
 
 
 @dataclass(frozen=True)
@@ -36,45 +40,72 @@ class Resolved:
     coverage: Tensor  # (pixels, M) float64 share of the exposure in which each mesh is visible
 
 
-def composite_cells(surfaces: Surfaces, face_of_interval: Tensor, cells: Cells, cutoff: float) -> Composite:
-    """Return what every cell shows, front to back.
+def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, samples: Samples, cutoff: float) -> Composite:
+    """Return what every sample shows, front to back.
 
     Args:
-        surfaces: appearance of the faces.
-        face_of_interval: (N,) int64 of the intervals the cells were cut from.
+        prisms: of the scene.
+        intervals: from which the cells were cut.
         cells: with layers nearest first.
+        samples: of the cells.
         cutoff: transmittance at which a ray ends; see `packed.transmittance`.
 
-    Accuracy: exact for flat colour and opacity; with a cut-off, see `Accuracy`.
-    Gradient: to colour and opacity.
+    Accuracy: opacities are multiplied at each time, never their means; with a cut-off, see `Accuracy`.
+    Gradient: to colour, opacity, texture, and through the samples' times.
     Source: Ronnow et al. 2021, alg. 1.
     """
-    face = face_of_interval[cells.layer_interval]
-    alpha = surfaces.opacity[face]
-    before, after = packed.transmittance(alpha, cells.layer_offsets, cutoff)
-    layer_rgb = (before * alpha).unsqueeze(1) * surfaces.rgb[face]
-    rgba = torch.cat([packed.sum_by_owner(layer_rgb, cells.layer_offsets), (1 - after).unsqueeze(1)], dim=1)
+    counts = cells.layer_offsets.diff()[samples.cell]
+    layer, sample = packed.expand(cells.layer_offsets[samples.cell], counts)
+    offsets = packed.offsets_from_counts(counts)
+    surfaces, interval = prisms.surfaces, cells.layer_interval[layer]
+    prism = intervals.prism[interval]
+    face = prisms.face_of[prism]
+    texel = None
+    if surfaces.is_textured[face].any():
+        ray = intervals.ray_ndc[:, packed.owners(intervals.offsets)[interval]]
+        texel = texels_on_prisms(prisms, prism, ray, samples.t[sample])
+    rgb, alpha = look(surfaces, face, texel)
+    before, after = packed.transmittance(alpha, offsets, cutoff)
+    light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
     n_meshes = max(1, len(surfaces.first_face))
     visible = ((before.detach() > 0) & (alpha.detach() > 0)).nonzero().flatten()
-    cell = packed.owners(cells.layer_offsets)[visible]
-    seen = torch.unique(cell * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once a cell
-    return Composite(rgba, seen // n_meshes, seen % n_meshes)
+    seen = torch.unique(sample[visible] * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once
+    return Composite(torch.cat([light, (1 - after).unsqueeze(1)], dim=1), seen // n_meshes, seen % n_meshes)
 
 
-def expose_cells(cells: Cells, composite: Composite, weight: Tensor, n_meshes: int) -> Resolved:
-    """Return the mean of the cells of each pixel under a shutter.
+def weigh_samples(shutter: Shutter, cells: Cells, samples: Samples, line: Tensor) -> Tensor:
+    """Return the weight (S,) of each sample under a shutter.
 
     Args:
-        cells: in time order.
-        composite: of the same cells.
-        weight: (C,) of each cell, from the shutter.
+        shutter: whose bends lie between the samples' panels.
+        cells: of the samples.
+        samples: one for a flat cell, Gauss's nodes for the others.
+        line: (S,) line of the image that each sample belongs to.
+
+    Gradient: to the cells' times.
+    Source: ours.
+    """
+    start, end = cells.t_start[samples.cell], cells.t_end[samples.cell]
+    whole = shutter.weight(start, end, line)
+    if samples.is_flat.all():
+        return whole
+    return torch.where(samples.is_flat, whole, (end - start) * samples.share * shutter.density(samples.t, line))
+
+
+def expose_samples(offsets: Tensor, composite: Composite, weight: Tensor, n_meshes: int) -> Resolved:
+    """Return the mean of the samples of each pixel.
+
+    Args:
+        offsets: (pixels + 1,) of the samples.
+        composite: of the samples.
+        weight: (S,) of each sample.
         n_meshes: M.
 
-    Gradient: through the composite, and to the cells' times through the weight.
+    Gradient: through composite and weight.
     Source: the rendering integral of Ronnow et al. 2021, sec. 3.
     """
-    rgba = packed.sum_by_owner(weight.unsqueeze(1) * composite.rgba, cells.offsets)
-    n_pixels = len(cells.offsets) - 1
-    target = packed.owners(cells.offsets)[composite.seen_cell] * n_meshes + composite.seen_mesh
-    coverage = weight.new_zeros(n_pixels * n_meshes).index_add(0, target, weight[composite.seen_cell])
+    rgba = packed.sum_by_owner(weight.unsqueeze(1) * composite.rgba, offsets)
+    n_pixels = len(offsets) - 1
+    target = packed.owners(offsets)[composite.seen_sample] * n_meshes + composite.seen_mesh
+    coverage = weight.new_zeros(n_pixels * n_meshes).index_add(0, target, weight[composite.seen_sample])
     return Resolved(rgba[:, :3], rgba[:, 3], coverage.reshape(n_pixels, n_meshes))

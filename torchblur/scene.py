@@ -15,6 +15,8 @@ from torch import Tensor
 from torchblur import check
 from torchblur.camera import Camera, lerp_knots, project_world
 
+WRAPS = ("repeat", "clamp")
+
 
 @dataclass(frozen=True, eq=False)
 class Material:
@@ -23,6 +25,9 @@ class Material:
     Args:
         color: (3,) or (F, 3) linear RGB, at least 0; above 1 is light that outshines white.
         opacity: a number or (F,), in [0, 1].
+        texture: (h, w, 3) linear RGB that multiplies the colour, or (h, w, 4) with an opacity that multiplies the
+            opacity; row 0 is the top, v = 0 the bottom edge; texel centres at (k + 0.5) / size; bilinear.
+        wrap: "repeat" or "clamp": what uv outside [0, 1] mean.
         double_sided: show back faces too; otherwise only faces whose vertices turn counter-clockwise on screen,
             decided exactly in time.
 
@@ -33,6 +38,8 @@ class Material:
     color: Any = (0.8, 0.8, 0.8)
     opacity: Any = 1.0
     double_sided: bool = True
+    texture: Any = None
+    wrap: str = "repeat"
 
     def __post_init__(self) -> None:
         color = check.floats("color", self.color, (3,), ("F", 3))
@@ -41,8 +48,11 @@ class Material:
         opacity = check.unit_range("opacity", check.floats("opacity", self.opacity, (), ("F",)))
         if not isinstance(self.double_sided, bool):
             raise check.fail_type("double_sided", "True or False", self.double_sided)
+        if self.wrap not in WRAPS:
+            raise check.fail("wrap", " or ".join(WRAPS), self.wrap)
         object.__setattr__(self, "color", color)
         object.__setattr__(self, "opacity", opacity)
+        object.__setattr__(self, "texture", None if self.texture is None else _checked_texture(self.texture))
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +62,8 @@ class Mesh:
     Args:
         vertices: (V, 3) static, or (K+1, V, 3) at equally spaced shutter times [scene units], float32 or float64.
         faces: (F, 3) integers in [0, V).
-        material: colour, opacity, sides; per-face values must be F long.
+        material: colour, opacity, texture, sides; per-face values must be F long.
+        uv: (F, 3, 2) float texture coordinates of the faces' corners; a texture needs them.
         name: for messages and metadata.
 
     Raises:
@@ -68,6 +79,7 @@ class Mesh:
     faces: Any
     material: Material = field(default_factory=Material)
     name: str = "mesh"
+    uv: Any = None
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -85,8 +97,12 @@ class Mesh:
             raise check.fail("color", f"(3,) or ({len(faces)}, 3), one row a face", color)
         if opacity.ndim == 1 and len(opacity) != len(faces):
             raise check.fail("opacity", f"a number or ({len(faces)},), one value a face", opacity)
+        if self.uv is None and self.material.texture is not None:
+            raise check.fail("uv", f"({len(faces)}, 3, 2) floats, as the material has a texture", "none")
+        uv = None if self.uv is None else check.floats("uv", self.uv, (len(faces), 3, 2))
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
+        object.__setattr__(self, "uv", uv)
 
     @property
     def n_segments(self) -> int:
@@ -146,8 +162,10 @@ class Scene:
         named |= {f"meshes[{i}].faces": m.faces for i, m in enumerate(self.meshes)}
         check.same_device(**{"camera.world_to_clip": self.camera.world_to_clip, **named})
         for i, mesh in enumerate(self.meshes):
-            for part in ("color", "opacity"):
-                _same_device_if_large(f"meshes[{i}].material.{part}", getattr(mesh.material, part), device)
+            parts = {f"material.{part}": getattr(mesh.material, part) for part in ("color", "opacity", "texture")}
+            for part, value in (parts | {"uv": mesh.uv}).items():
+                if value is not None:
+                    _same_device_if_large(f"meshes[{i}].{part}", value, device)
         _same_device_if_large("background", background, device)
         object.__setattr__(self, "background", background)
 
@@ -195,13 +213,25 @@ class Scene:
         """Return all floating tensors of the scene."""
         parts = [self.camera.world_to_clip, self.background]
         for mesh in self.meshes:
-            parts += [mesh.vertices, mesh.material.color, mesh.material.opacity]
-        return parts
+            parts += [mesh.vertices, mesh.material.color, mesh.material.opacity, mesh.material.texture, mesh.uv]
+        return [part for part in parts if part is not None]
 
     @property
     def requires_grad(self) -> bool:
         """Whether anything in the scene asks for gradients."""
         return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors())
+
+
+def _checked_texture(texture: Any) -> Tensor:
+    """Return the texture as (h, w, 3 or 4) finite floats, colours at least 0 and opacities in [0, 1]."""
+    image = check.floats("texture", texture, ("h", "w", 3), ("h", "w", 4))
+    if 0 in image.shape:
+        raise check.fail("texture", "at least one texel", image)
+    if (image.detach() < 0).any():
+        raise check.fail("texture", "values of at least 0", f"{float(image.detach().min())}")
+    if image.shape[2] == 4:
+        check.unit_range("texture's opacity", image[..., 3])
+    return image
 
 
 def _same_device_if_large(name: str, value: Tensor, device: torch.device) -> None:

@@ -153,6 +153,16 @@ class Shutter:
         delay = self.line_delay * line.to(t_start.dtype)
         return self._integral(t_end - delay) - self._integral(t_start - delay)
 
+    def density(self, t: Tensor, line: Tensor) -> Tensor:
+        """Return h at the shutter times `t` (n,) for pixels of `line` (n,); at a jump, either value. Source: ours."""
+        t = t - self.line_delay * line.to(t.dtype)
+        times = torch.tensor(self.times, dtype=t.dtype, device=t.device)
+        weights = torch.tensor(self.weights, dtype=t.dtype, device=t.device)
+        area = (0.5 * (weights[1:] + weights[:-1]) * times.diff()).sum()
+        k = (torch.searchsorted(times, t.detach(), right=True) - 1).clamp(0, len(times) - 2)
+        h = weights[k] + (t - times[k]) / times.diff()[k] * weights.diff()[k]
+        return torch.where((t >= self.t_open) & (t <= self.t_close), h / area, 0.0)
+
     def _integral(self, t: Tensor) -> Tensor:
         """Return H (n,) at shutter times of the first line: 0 before it opens, 1 after it closes."""
         times = torch.tensor(self.times, dtype=t.dtype, device=t.device)

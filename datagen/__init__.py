@@ -1,8 +1,8 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
-Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, assets, sequences,
-shapes, patterns, stages, casts, scenes, samples, pictures, writer, manifest, executors, progress, dataset, report,
-runs, __main__.
+Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
+sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, manifest, executors, progress, dataset,
+report, runs, __main__.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from datagen.assets import MeshError
     from datagen.dataset import BlurDataset
+    from datagen.formats import MeshError
     from datagen.manifest import ManifestError, verify_dataset
     from datagen.runs import RunResult, generate
     from datagen.spec import DatasetSpec, SpecError, parse_spec
@@ -24,7 +24,7 @@ _HOMES = {
     "DatasetSpec": "spec",
     "FrameFileError": "writer",
     "ManifestError": "manifest",
-    "MeshError": "assets",
+    "MeshError": "formats",
     "RunResult": "runs",
     "SpecError": "spec",
     "generate": "runs",

@@ -84,14 +84,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(spec: Any, arguments: Arguments) -> int:
     """Generate and tell how it went."""
-    from datagen.assets import MeshError
-    from datagen.manifest import ManifestError
+    from datagen.formats import MeshError
     from datagen.runs import generate
     from datagen.writer import FrameFileError
 
     try:
         result = generate(spec, arguments.out, arguments.workers, is_quiet=False)
-    except (SpecError, MeshError, ManifestError) as error:
+    except (SpecError, MeshError) as error:
         return _usage(str(error).splitlines())
     except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again
         print(f"error: {error}", file=sys.stderr)

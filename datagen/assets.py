@@ -1,6 +1,6 @@
 """Assets: people's mesh files, read with distrust (the only door to trimesh).
 
-Before: colour.py.  After: sequences.py, scenes.py.
+Before: colour.py, formats.py.  After: sequences.py, scenes.py.
 Symbols: V vertices, F faces. Nothing is merged, renumbered or repaired: order is kept.
 """
 
@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import json
+import io
 import os
-import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ import trimesh
 from torch import Tensor
 
 from datagen.colour import linear_from_srgb
+from datagen.formats import MeshError, announced_faces, read_checked, short_reason, utf8_text
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 # Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
@@ -29,20 +29,12 @@ UNREAD_SUFFIXES = (
     ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usd", ".usda", ".usdc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
     ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
 )  # fmt: skip
-MAX_FILE_BYTES = 256 * 2**20  # parsing takes several times as much memory
 MAX_FACES = 50_000_000
 MAX_VERTICES = 25_000_000
 MAX_COORDINATE = 1e6  # beyond it float32 positions are coarser than a thousandth
-READABLE_EXTENSIONS = re.compile(r"KHR_(materials_\w+|texture_transform|lights_punctual)")
+SMALLEST_EXTENT = 1e-12  # of what is scaled to a radius of 1: below it there is rounding only
+FACES_AT_ONCE = 1_000_000
 DEFAULT_GREYS = ((102, 102, 102), (128, 128, 128))  # trimesh's own colour where a file has none
-
-
-class MeshError(ValueError):
-    """A file that cannot be used, and why."""
-
-    def __init__(self, path: str | Path, reason: str) -> None:
-        super().__init__(f"{path}: {reason}")
-        self.path, self.reason = str(path), reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +47,15 @@ class MeshAsset:
     color: Tensor | None  # (F, 3) float64 linear, or none in the file
     opacity: Tensor | None  # (F,) float64, or none in the file
     notes: tuple[str, ...]  # what in the file is not used
+
+
+class CompanionFiles(trimesh.resolvers.FilePathResolver):
+    """The files beside a mesh file that it may name: nothing above its folder, nothing from a network."""
+
+    def get(self, name: str) -> bytes:
+        """Return the bytes of a companion file, the text of a material library made UTF-8. Source: ours."""
+        data = super().get(name)
+        return utf8_text(data) if Path(name.strip()).suffix.lower() == ".mtl" else data
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def load_mesh(path: str) -> MeshAsset:
 def _load_mesh(path: str, state: tuple[int, int]) -> MeshAsset:
     """Return the mesh of a file in a certain state."""
     vertices, faces, color, opacity, notes = parse_mesh(Path(path))
-    vertices = normalise(path, vertices[None])[0]
+    vertices = normalise(path, vertices[None], faces)[0]
     return MeshAsset(Path(path).name, vertices, faces, color, opacity, notes)
 
 
@@ -142,19 +143,17 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
         raise MeshError(path, f"expected one of {', '.join(MESH_SUFFIXES)}, got {suffix or 'no suffix'}")
-    check_size(path)
-    notes = _gltf_notes(path) if suffix in (".glb", ".gltf") else ()
+    data, notes = read_checked(path)
+    options = {"process": False, "allow_remote": False, "resolver": CompanionFiles(str(path))}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the gate below decides, not the parser
-            scene = trimesh.load_scene(path, process=False, allow_remote=False)
+            scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], **options)
             parts = [_part(scene, node) for node in sorted(scene.graph.nodes_geometry, key=str)]
     except MeshError:
         raise
     except ModuleNotFoundError as error:
-        why = (
-            "text that is not UTF-8" if error.name in ("charset_normalizer", "chardet") else f"a need for {error.name}"
-        )
+        why = f"a need for {error.name}"
         raise MeshError(path, f"expected a file readable without further packages, got {why}") from None
     except Exception as error:  # the parsers raise ValueError, IndexError, KeyError, UnboundLocalError and more
         raise MeshError(path, f"expected a readable {suffix} file, got {short_reason(error)}") from None
@@ -163,7 +162,7 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
         raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
     if not parts:
         raise MeshError(path, "expected triangles, got none")
-    announced, found = _announced_faces(path), sum(len(p[1]) for p in parts)
+    announced, found = announced_faces(suffix, data), sum(len(p[1]) for p in parts)
     if found < announced:  # the parser takes a text file that was cut short for a smaller mesh
         raise MeshError(path, f"expected {announced} faces as its header says, got {found}")
     checked = [check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
@@ -176,16 +175,6 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
     color = None if rgba is None else linear_from_srgb(rgba[:, :3].contiguous())
     opacity = rgba[:, 3].contiguous() if rgba is not None and bool((rgba[:, 3] < 1).any()) else None
     return torch.cat([v for v, _ in checked]), faces, color, opacity, notes
-
-
-def _announced_faces(path: Path) -> int:
-    """Return how many faces the header of a PLY file promises; 0 for other files."""
-    if path.suffix.lower() != ".ply":
-        return 0
-    with path.open("rb") as file:
-        header = file.read(65536).split(b"end_header")[0]
-    match = re.search(rb"element\s+face\s+(\d+)", header)
-    return int(match[1]) if match else 0
 
 
 def _part(scene: Any, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:
@@ -226,40 +215,6 @@ def _part_rgba(geometry: Any, faces: np.ndarray) -> np.ndarray | None:
     return colours.astype(np.float64) / 255
 
 
-def _gltf_notes(path: Path) -> tuple[str, ...]:
-    """Refuse glTF files whose meshes need an extension that is not read; return notes on animations."""
-    try:
-        blob = path.read_bytes()
-        if path.suffix.lower() == ".glb" and len(blob) >= 20:
-            blob = blob[20 : 20 + int.from_bytes(blob[12:16], "little")]
-        tree = json.loads(blob.decode("utf-8-sig"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise MeshError(path, f"expected glTF with JSON inside, got {short_reason(error)}") from None
-    if not isinstance(tree, dict):
-        raise MeshError(path, f"expected a glTF object, got a JSON {type(tree).__name__}")
-    # Without its decoder the parser fills a compressed mesh with zeros and says nothing.
-    needed = [e for e in tree.get("extensionsRequired") or [] if not READABLE_EXTENSIONS.fullmatch(str(e))]
-    needed += [
-        e for e in ("KHR_draco_mesh_compression", "EXT_meshopt_compression") if e in (tree.get("extensionsUsed") or [])
-    ]
-    if needed:
-        raise MeshError(path, f"expected no required extension, got {', '.join(sorted(set(map(str, needed))))}")
-    still = [k for k in ("animations", "skins") if tree.get(k)]
-    return (f"{' and '.join(still)} in the file are not read: the mesh keeps its rest pose",) if still else ()
-
-
-def check_size(path: Path) -> None:
-    """Raise MeshError for a file that is missing, empty or too large to be parsed safely. Source: ours."""
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise MeshError(path, f"expected a file, got {short_reason(error)}") from None
-    if not path.is_file():
-        raise MeshError(path, "expected a file, got something else")
-    if not 0 < size <= MAX_FILE_BYTES:
-        raise MeshError(path, f"expected 1 to {MAX_FILE_BYTES} bytes, got {size}")
-
-
 def check_geometry(path: str | Path, vertices: np.ndarray, faces: np.ndarray, n_vertices: int) -> tuple[Tensor, Tensor]:
     """Return vertices (N, 3) float64 and faces (F, 3) int64: the gate that every mesh passes.
 
@@ -289,17 +244,29 @@ def check_geometry(path: str | Path, vertices: np.ndarray, faces: np.ndarray, n_
     return torch.from_numpy(np.ascontiguousarray(vertices)), torch.from_numpy(faces.astype(np.int64))
 
 
-def normalise(path: str | Path, positions: Tensor) -> Tensor:
-    """Return (P, V, 3) positions centred and scaled to a bounding radius of 1, or raise MeshError if all are one point.
+def normalise(path: str | Path, positions: Tensor, faces: Tensor) -> Tensor:
+    """Return (P, V, 3) positions centred and scaled to a bounding radius of 1.
+
+    Raises:
+        MeshError: all are one point, or no triangle of `faces` (F, 3) ever has an area: there is nothing to be seen.
 
     Source: ours.
     """
     points = positions.reshape(-1, 3)
     centred = positions - (points.amin(0) + points.amax(0)) / 2
     radius = float(centred.norm(dim=-1).max())
-    if not radius > 1e-12:
+    if not radius > SMALLEST_EXTENT:
         raise MeshError(path, f"vertices: expected some extent, got a radius of {radius:g}")
-    return centred / radius
+    scaled = centred / radius
+    if not any(_has_area(frame[part]) for frame in scaled for part in faces.split(FACES_AT_ONCE)):
+        raise MeshError(path, "faces: expected a triangle with an area, got none")
+    return scaled
+
+
+def _has_area(corners: Tensor) -> bool:
+    """Tell whether any of the (F, 3, 3) triangles is more than a line."""
+    a, b, c = corners.unbind(1)
+    return float(torch.linalg.cross(b - a, c - a).norm(dim=-1).max()) > SMALLEST_EXTENT
 
 
 def tensors_sha256(*tensors: Tensor | None) -> bytes:
@@ -311,9 +278,3 @@ def tensors_sha256(*tensors: Tensor | None) -> bytes:
     for tensor in tensors:
         digest.update(b"none" if tensor is None else str(tuple(tensor.shape)).encode() + tensor.numpy().tobytes())
     return digest.digest()
-
-
-def short_reason(error: BaseException) -> str:
-    """Return an exception as one short line. Source: ours."""
-    text = " ".join(str(error).split())[:200]
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__

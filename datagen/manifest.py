@@ -3,6 +3,7 @@
 Before: writer.py.  After: runs.py, dataset.py.
 `run.json` holds the specification; `manifest.jsonl` one line for each finished frame, with the checksums of its files.
 A frame counts from the moment its line is on the disk: that line is the commit point.
+A run takes no frame on trust: the bytes of every listed file are compared, and what does not fit is made again.
 """
 
 from __future__ import annotations
@@ -10,8 +11,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +33,16 @@ RUN_NAME, MANIFEST_NAME, LOCK_NAME = "run.json", "manifest.jsonl", ".lock"
 
 
 class ManifestError(ValueError):
-    """A manifest that is damaged other than by a line cut short at its end."""
+    """A manifest that is damaged other than by a line cut short at its end; a run repairs it."""
+
+
+@dataclass(frozen=True)
+class Holdings:
+    """What a folder already holds at the start of a run."""
+
+    entries: dict[int, dict[str, Any]]  # by frame, of those whose files are all as listed
+    damaged: dict[int, str]  # by frame, of those that are listed but must be made again: why
+    notes: tuple[str, ...]  # on lines of the manifest that are passed over
 
 
 @contextmanager
@@ -60,10 +72,10 @@ def locked_folder(out: str | Path) -> Iterator[Path]:
         os.close(descriptor)
 
 
-def begin_run(folder: Path, plan: Plan) -> dict[int, dict[str, Any]]:
-    """Prepare a locked folder for a run and return the entries of the frames it already holds.
+def begin_run(folder: Path, plan: Plan) -> Holdings:
+    """Prepare a locked folder for a run and return what it already holds.
 
-    Files left behind by a killed run are removed. Frames whose files are gone or have another size are not returned.
+    Files left behind by a killed run are removed. Every listed file is read and compared with its checksum.
 
     Args:
         folder: held by `locked_folder`.
@@ -71,7 +83,6 @@ def begin_run(folder: Path, plan: Plan) -> dict[int, dict[str, Any]]:
 
     Raises:
         SpecError: the folder holds data of another configuration; the fields that differ are named.
-        ManifestError: its manifest is damaged.
 
     Source: ours.
     """
@@ -86,16 +97,29 @@ def begin_run(folder: Path, plan: Plan) -> dict[int, dict[str, Any]]:
         if strange:  # people's own files are not to be mixed with, still less swept
             found = ", ".join(strange[:3]) + (", …" if len(strange) > 3 else "")
             raise SpecError([f"out: expected an empty folder or a data set with its {RUN_NAME}, got {found}"])
+    lines, notes = _scan_manifest(folder) if (folder / MANIFEST_NAME).exists() else ([], [])
+    found = {entry["config_sha256"] for entry in lines}
+    if found and plan.config_sha256 not in found:  # among fitting ones, a line that does not fit is a damaged line
+        wanted_sum = plan.config_sha256
+        raise SpecError([f"out: expected frames of configuration {wanted_sum} in {folder}, got {min(found)}"])
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     for holder in (folder, *(folder / name for name in FOLDERS)):
         for stale in holder.glob(TEMPORARY_PATTERN):
             stale.unlink(missing_ok=True)
-    entries = read_manifest(folder) if (folder / MANIFEST_NAME).exists() else {}
-    entries = {i: e for i, e in entries.items() if _files_are_there(folder, e)}
+    entries, damaged = {}, {}
+    for entry in lines:
+        problem = _damage(folder, entry, plan)
+        if problem:
+            damaged[entry["index"]] = problem
+        else:
+            entries[entry["index"]] = entry
+    for index in sorted(set(entries) & set(damaged)):  # of two lines for one frame, the one that its files fit counts
+        notes.append(f"{MANIFEST_NAME}: expected one entry of frame {index}, got two that differ")
+        del damaged[index]
     write_atomically(place, (json.dumps(wanted, indent=1, sort_keys=True) + "\n").encode())
     write_manifest(folder, entries)  # without a torn line, so that new ones start on their own
-    return entries
+    return Holdings(entries, damaged, tuple(notes))
 
 
 def read_manifest(folder: str | Path) -> dict[int, dict[str, Any]]:
@@ -107,20 +131,13 @@ def read_manifest(folder: str | Path) -> dict[int, dict[str, Any]]:
 
     Source: ours.
     """
-    path = Path(folder) / MANIFEST_NAME
-    lines = path.read_bytes().split(b"\n")
     entries: dict[int, dict[str, Any]] = {}
-    for number, line in enumerate(lines[:-1]):  # what follows the last line end was not finished
-        try:
-            entry = json.loads(line)
-            index = entry["index"]
-            complete = isinstance(index, int) and index >= 0 and all(f["path"] and f["sha256"] for f in entry["files"])
-        except (ValueError, KeyError, TypeError):
-            complete = False
-        if not complete:
-            raise ManifestError(f"{path}: expected a finished frame in line {number + 1}, got {line[:60]!r}")
-        if entries.setdefault(index, entry) != entry:
-            raise ManifestError(f"{path}: expected one entry of frame {index}, got two that differ")
+    lines, notes = _scan_manifest(Path(folder))
+    if notes:
+        raise ManifestError(f"{folder}: {notes[0]}")
+    for entry in lines:
+        if entries.setdefault(entry["index"], entry) != entry:
+            raise ManifestError(f"{folder}: expected one entry of frame {entry['index']}, got two that differ")
     return dict(sorted(entries.items()))
 
 
@@ -212,10 +229,49 @@ def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) ->
     return problems
 
 
-def _files_are_there(folder: Path, entry: dict[str, Any]) -> bool:
-    """Tell whether all files of an entry exist with the size they were written with."""
-    expected = set(frame_paths(entry["index"]).values())
-    sizes = {f["path"]: f["bytes"] for f in entry["files"]}
-    if set(sizes) != expected:
+def _scan_manifest(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the entries in the order of their lines, and a note on each line that is none."""
+    lines = (folder / MANIFEST_NAME).read_bytes().split(b"\n")
+    entries, notes = [], []
+    for number, line in enumerate(lines[:-1]):  # what follows the last line end was not finished
+        try:
+            entry = json.loads(line)
+            is_valid = _is_entry(entry)
+        except (ValueError, KeyError, TypeError, RecursionError):
+            is_valid = False
+        if is_valid:
+            entries.append(entry)
+        else:
+            found = line[:60].decode("utf-8", "replace")
+            notes.append(f"{MANIFEST_NAME}: expected a finished frame in line {number + 1}, got {found!r}")
+    return entries, notes
+
+
+def _is_entry(entry: Any) -> bool:
+    """Tell whether a JSON value is the entry of a frame, with just its files."""
+    index, files = entry["index"], entry["files"]
+    if type(index) is not int or index < 0 or not isinstance(entry["config_sha256"], str):
         return False
-    return all((folder / p).is_file() and (folder / p).stat().st_size == n for p, n in sizes.items())
+    sums_fit = all(re.fullmatch("[0-9a-f]{64}", file["sha256"]) for file in files)
+    return sums_fit and sorted(file["path"] for file in files) == sorted(frame_paths(index).values())
+
+
+def _damage(folder: Path, entry: dict[str, Any], plan: Plan) -> str:
+    """Return what is wrong with a listed frame, or an empty string if every byte of it is as listed."""
+    clip, frame = plan.spec.clip_and_frame(entry["index"])
+    expected = {"index": entry["index"], "clip": clip, "frame": frame, "config_sha256": plan.config_sha256}
+    if {name: value for name, value in entry.items() if name != "files"} != expected:
+        return f"its line in {MANIFEST_NAME} is not of this configuration"
+    return ", ".join(filter(None, (_file_damage(folder, file) for file in entry["files"])))
+
+
+def _file_damage(folder: Path, file: dict[str, Any]) -> str:
+    """Return what is wrong with a listed file, or an empty string."""
+    try:
+        data = (folder / file["path"]).read_bytes()
+    except FileNotFoundError:
+        return f"{file['path']} is missing"
+    except OSError as error:
+        return f"{file['path']} cannot be read ({error.strerror})"
+    is_same = hashlib.sha256(data).hexdigest() == file["sha256"] and len(data) == file.get("bytes")
+    return "" if is_same else f"{file['path']} differs from the manifest"

@@ -26,12 +26,6 @@ def encode_png(pixels: np.ndarray) -> bytes:
     return buffer.getvalue()
 
 
-def decode_png(data: bytes) -> np.ndarray:
-    """Return the (H, W, 3) uint8 pixels of a PNG. Source: ours."""
-    with Image.open(io.BytesIO(data), formats=["PNG"]) as image:
-        return np.asarray(image.convert("RGB"))
-
-
 def write_labels(pixels: np.ndarray, labels: list[tuple[int, int, str]], shade: int = 40) -> np.ndarray:
     """Return the picture with short texts at (x, y) [px].
 

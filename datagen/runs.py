@@ -31,6 +31,7 @@ class RunResult:
     failed: tuple[tuple[int, str], ...]  # (frame, reason)
     refused: tuple[tuple[str, str], ...]  # (asset, reason)
     contact_sheet: Path | None  # none if no frame is finished
+    repaired: tuple[str, ...] = ()  # what an earlier run had listed and was found damaged, a line each
 
     @property
     def is_complete(self) -> bool:
@@ -45,14 +46,14 @@ def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: boo
 
     Args:
         spec: what to make.
-        out: folder; created if need be. Finished frames in it are kept.
+        out: folder; created if need be. Finished frames in it are kept if every byte is as the manifest lists it;
+            the others are made again.
         workers: processes; 0 and 1 work in this one.
         is_quiet: show no progress on stderr.
 
     Raises:
         SpecError: the folder holds other data, is held by another run, or `workers` is negative.
         MeshError: none of the assets can be used; nothing has been written then.
-        ManifestError: the folder's manifest is damaged.
 
     Source: ours.
     """
@@ -61,13 +62,16 @@ def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: boo
     roster = survey_assets(spec)
     plan = Plan(spec, roster.names, roster.sha256)
     with locked_folder(out) as folder:
-        entries = begin_run(folder, plan)
-        kept = len(entries)
+        holdings = begin_run(folder, plan)
+        entries, kept = holdings.entries, len(holdings.entries)
+        repaired = [f"{note}; made again if a frame was lost with it" for note in holdings.notes]
         todo = [i for i in range(spec.count) if i not in entries]
         failed = []
         with Progress(spec.count, kept, is_quiet) as progress:
             if roster.refused:
                 progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
+            for line in repaired:
+                progress.say(line)
             text = plan.to_json()
             if workers <= 1:
                 outcomes = run_serial(make_frame, text, str(folder), todo)
@@ -80,12 +84,16 @@ def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: boo
                 else:
                     entries[outcome.index] = json.loads(outcome.text)
                     append_entry(folder, entries[outcome.index])
+                    if outcome.index in holdings.damaged:
+                        repaired.append(f"frame {outcome.index}: {holdings.damaged[outcome.index]}; made again")
+                        progress.say(repaired[-1])
                 progress.step(not outcome.error)
         write_manifest(folder, entries)
         failed.sort()
         _write_failures(folder, failed, list(roster.refused))
         sheet = write_contact_sheet(folder) if entries else None
-    return RunResult(folder, len(entries) - kept, kept, tuple(failed), roster.refused, sheet)
+    made = len(entries) - kept
+    return RunResult(folder, made, kept, tuple(failed), roster.refused, sheet, tuple(repaired))
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:

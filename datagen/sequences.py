@@ -1,6 +1,6 @@
 """Sequences: one mesh whose vertices move from frame to frame, from a `.npz`, a folder of files or one mesh file.
 
-Before: assets.py.  After: scenes.py.
+Before: formats.py, assets.py.  After: scenes.py.
 Symbols: V vertices, F faces, P frames.
 """
 
@@ -17,16 +17,14 @@ from torch import Tensor
 
 from datagen.assets import (
     MESH_SUFFIXES,
-    MeshError,
     Roster,
     check_geometry,
-    check_size,
     file_state,
     normalise,
     parse_mesh,
-    short_reason,
     tensors_sha256,
 )
+from datagen.formats import MeshError, check_size, short_reason
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +74,7 @@ def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAs
     if place.suffix.lower() != ".npz":
         vertices, faces, color, _, notes = parse_mesh(place)
         note = "one mesh file: a single frame, so the mesh itself stands still"
-        return SequenceAsset(place.name, normalise(path, vertices[None]), faces, color, (*notes, note))
+        return SequenceAsset(place.name, normalise(path, vertices[None], faces), faces, color, (*notes, note))
     check_size(place)
     try:
         with place.open("rb") as file, np.load(file, allow_pickle=False) as archive:
@@ -93,8 +91,8 @@ def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAs
         raise MeshError(path, f"vertices: expected (frames, V, 3) float, got {positions.shape} {positions.dtype}")
     if len(positions) < 1:
         raise MeshError(path, "vertices: expected at least one frame, got none")
-    checked = check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
-    return SequenceAsset(place.name, normalise(path, checked[0].reshape(positions.shape)), checked[1], None, ())
+    flat, indices = check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
+    return SequenceAsset(place.name, normalise(path, flat.reshape(positions.shape), indices), indices, None, ())
 
 
 def _load_frames(folder: Path) -> SequenceAsset:
@@ -109,7 +107,7 @@ def _load_frames(folder: Path) -> SequenceAsset:
         if not torch.equal(faces, first[0]) or (frames and vertices.shape != frames[0].shape):
             raise MeshError(folder / name, f"expected the vertices and faces of {names[0]}, got others")
         frames.append(vertices)
-    return SequenceAsset(folder.name, normalise(folder, torch.stack(frames)), first[0], first[1], first[2])
+    return SequenceAsset(folder.name, normalise(folder, torch.stack(frames), first[0]), *first)
 
 
 def _frame_names(folder: Path) -> list[str]:

@@ -149,15 +149,6 @@ def read_spec_fields(path: str | Path) -> dict[str, Any]:
         raise SpecError([f"config: expected a readable TOML file, got {str(path)!r}: {error}"]) from None
 
 
-def spec_to_toml(spec: DatasetSpec) -> str:
-    """Return the specification as TOML that `read_spec_fields` reads back equal. Source: ours."""
-    lines = []
-    for name, value in spec.model_dump().items():
-        if value is not None:  # JSON text of numbers and strings is TOML as well
-            lines.append(f"{name} = {json.dumps(value)}")
-    return "\n".join(lines) + "\n"
-
-
 def _problem_text(error: Any) -> str:
     """Return one of pydantic's errors in the project's form."""
     name = ".".join(str(p) for p in error["loc"])

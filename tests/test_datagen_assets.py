@@ -1,4 +1,5 @@
 import base64
+import io
 import json
 import struct
 import subprocess
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+import datagen.assets
 from datagen.assets import MeshError, load_mesh, survey_meshes
 from datagen.sequences import load_sequence, survey_sequence
 
@@ -55,6 +57,12 @@ def ply(faces="3 0 1 2\n", n_faces=1):
     return head + "0 0 0\n1 0 0\n0 1 0\n" + faces
 
 
+STL = b"made by hand".ljust(80) + struct.pack("<I", 2)
+STL += struct.pack("<12fH", *[0, 0, 0, 0, 0, 0, 3, 0, 0, 0, 3, 0], 0) * 2
+TEXT_STL = "solid x\n" + "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+TEXT_STL += "endsolid x\n"
+
+
 BAD = {
     "empty.obj": ("", "expected 1 to"),
     "points.obj": (TETRAHEDRON, "triangles, got none"),
@@ -68,8 +76,18 @@ BAD = {
     "negative.ply": (ply("3 0 1 -2\n"), "expected"),
     "short.ply": (ply(n_faces=5), "expected"),
     "words.ply": ("ply\nnonsense", "expected a readable .ply"),
-    "short.stl": (b"\0" * 80 + struct.pack("<I", 4) + b"\1" * 30, "expected"),
-    "huge.stl": (b"\0" * 80 + struct.pack("<I", 4_000_000_000), "expected"),
+    "line.obj": ("v 0 0 0\nv 1 2 3\nv 2 4 6\nf 1 2 3\nf 1 1 2\n", "faces: expected a triangle with an area, got none"),
+    "corner.obj": (GOOD[:-3], "at least 3 whole corners in the last face, got 'f 2 4'"),
+    "corners.obj": (GOOD.replace("f 2 4 3\n", "f 2 \\\n4"), "at least 3 whole corners in the last face, got 'f 2 4'"),
+    "letter.obj": (GOOD[:-6] + " # end\n\n", "at least 3 whole corners in the last face, got 'f'"),
+    "slash.obj": (TETRAHEDRON + "f 1/1/1 2/1/1 3/1/1\nf 1/1/1 4/1/1 2/1/", "at least 3 whole corners"),
+    "short.stl": (STL[:-30], "expected 184 bytes for the 2 triangles its header announces, got 154"),
+    "long.stl": (STL + b"\xe9", "expected 184 bytes for the 2 triangles its header announces, got 185"),
+    "solid.stl": (b"solid" + STL[5:-1], "expected 184 bytes for the 2 triangles its header announces, got 183"),
+    "stub.stl": (STL[:50], "expected at least the 84 bytes of a header, got 50"),
+    "nan.stl": (STL.replace(struct.pack("<f", 3), struct.pack("<f", float("nan"))), "finite values, got nan"),
+    "text.stl": (TEXT_STL[:-20], "expected endsolid after the last facet, got a file cut short"),
+    "huge.stl": (b"\0" * 80 + struct.pack("<I", 4_000_000_000), "for the 4000000000 triangles its header announces"),
     "none.off": ("OFF\n3 0 0\n0 0 0\n1 0 0\n0 1 0\n", "triangles, got none"),
     "huge.off": ("OFF\n99999999999 1 0\n0 0 0\n", "expected a readable .off"),
     "words.glb": (b"glTF not really", "expected"),
@@ -78,7 +96,9 @@ BAD = {
     "nan.gltf": (gltf(positions=((float("nan"), 0, 0), (1, 0, 0), (0, 1, 0))), "finite"),
     "draco.gltf": (gltf({"extensionsRequired": ["KHR_draco_mesh_compression"]}), "KHR_draco_mesh_compression"),
     "outside.gltf": (gltf({"buffers": [{"byteLength": 44, "uri": "../secret.bin"}]}), "expected a readable .gltf"),
-    "remote.gltf": (gltf({"buffers": REMOTE}), "expected a readable .gltf"),
+    "remote.gltf": (gltf({"buffers": REMOTE}), "in files beside it, got 'http://localhost:9/x.bin'"),
+    "picture.gltf": (gltf({"images": [{"uri": "HTTPS://localhost:9/x.png"}]}), "got 'HTTPS://localhost:9/x.png'"),
+    "odd.gltf": (gltf({"images": 5, "extensionsUsed": 5, "buffers": 5}), "expected a readable .gltf"),
     "pack.zip": (b"PK\3\4", "expected one of .obj"),
     "scene.fbx": (b"x", "expected one of .obj"),
 }  # fmt: skip
@@ -233,3 +253,75 @@ def test_nothing_is_fetched_from_a_network_by_a_mesh(tmp_path):
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stdout) == (0, "")
+
+
+def test_what_one_byte_more_would_make_whole_is_read(tmp_path):
+    """The twins of the refused files, so that no check refuses what is sound."""
+    twins = {"a.stl": STL, "b.stl": TEXT_STL, "c.stl": b"solid" + STL[5:], "d.obj": GOOD.rstrip()}
+    twins["e.obj"] = TETRAHEDRON + "f 1/1/1 2/1/1 3/1/1\nf 1//1 4//1 \\\n2//1\n# cut here\n"
+    twins["f.obj"] = GOOD + "v 7 7 7\nl 1 2\n"
+    twins["g.obj"] = "v 0 0 0\nv 1 2 3\nv 2 4 6\nv 0 1 0\nf 1 2 3\nf 1 2 4\n"  # one triangle of two has an area
+    for name, content in twins.items():
+        put(tmp_path, name, content)
+    assert survey_meshes(tmp_path).refused == ()
+
+
+def test_text_that_is_not_utf8_is_read_as_latin1(tmp_path):
+    colours = "# Möbel\nnewmtl Grün\nKd 0 1 0\n"
+    whole = "# größer\nmtllib Stühle.mtl\nusemtl Grün\n" + GOOD
+    for name in ("utf-8", "latin-1"):
+        folder = tmp_path / name
+        folder.mkdir()
+        put(folder, "Stühle.mtl", colours.encode(name))
+        asset = load_mesh(str(put(folder, "a.obj", whole.encode(name))))
+        assert asset.faces.shape == (4, 3)
+        torch.testing.assert_close(asset.color, torch.tensor([[0.0, 1, 0]], dtype=torch.float64).expand(4, 3))
+        put(folder, "b.ply", ply().replace("ascii 1.0", "ascii 1.0\ncomment größer").encode(name))
+        put(folder, "c.stl", TEXT_STL.replace("solid x", "solid größer").encode(name))
+        put(folder, "d.off", "OFF\n# größer\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".encode(name))
+        assert survey_meshes(folder).refused == ()
+    assert survey_meshes(tmp_path / "utf-8").sha256 == survey_meshes(tmp_path / "latin-1").sha256
+
+
+def test_a_sequence_needs_a_triangle_with_an_area_in_one_frame(tmp_path):
+    flat = np.zeros((3, 3, 3))
+    flat[:, 1, 0], flat[:, 2, 0] = 1, 2
+    faces = np.array([[0, 1, 2]])
+    with pytest.raises(MeshError, match="faces: expected a triangle with an area, got none"):
+        load_sequence(save_npz(tmp_path / "flat.npz", vertices=flat, faces=faces))
+    flat[2, 2, 1] = 1  # it opens in the last frame
+    assert len(load_sequence(save_npz(tmp_path / "opens.npz", vertices=flat, faces=faces)).positions) == 3
+    (tmp_path / "frames").mkdir()
+    for k, frame in enumerate(flat):
+        text = "".join(f"v {x} {y} {z}\n" for x, y, z in frame) + "f 1 2 3\n"
+        put(tmp_path / "frames", f"{k}.obj", text)
+    assert len(load_sequence(str(tmp_path / "frames")).positions) == 3
+
+
+def test_the_parser_is_given_bytes_and_no_way_to_a_network(tmp_path, monkeypatch):
+    real, calls = datagen.assets.trimesh.load_scene, []
+
+    def watched(*args, **kwargs):
+        calls.append((args, kwargs))
+        return real(*args, **kwargs)
+
+    monkeypatch.setattr(datagen.assets.trimesh, "load_scene", watched)
+    contents = {"a.obj": GOOD, "b.ply": ply(), "c.stl": STL, "d.gltf": gltf()}
+    for name, content in contents.items():
+        load_mesh(str(put(tmp_path, name, content)))
+    assert len(calls) == len(contents)
+    (tmp_path / "deep").mkdir()
+    put(tmp_path / "deep", "x.bin", "inside")
+    put(tmp_path.parent, "above.bin", "outside")
+    for args, kwargs in calls:
+        assert len(args) == 1
+        assert isinstance(args[0], io.BytesIO)  # a text could be taken for an address
+        assert set(kwargs) == {"file_type", "resolver", "process", "allow_remote"}
+        assert kwargs["allow_remote"] is False
+        assert kwargs["process"] is False
+        files = kwargs["resolver"]
+        assert isinstance(files, datagen.assets.trimesh.resolvers.FilePathResolver)
+        assert files.get("deep/x.bin") == b"inside"
+        for name in ("../above.bin", str(tmp_path.parent / "above.bin"), "http://localhost:9/y.bin"):
+            with pytest.raises((OSError, ValueError)):
+                files.get(name)

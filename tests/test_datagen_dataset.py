@@ -5,11 +5,17 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch.utils.data import DataLoader
 
 from datagen import BlurDataset, FrameFileError, generate, parse_spec, verify_dataset
-from datagen.pictures import decode_png
 from datagen.report import motion_colours
+
+
+def pixels_of(path):
+    with Image.open(path) as image:
+        assert (image.format, image.mode) == ("PNG", "RGB")
+        return np.asarray(image)
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +54,7 @@ def test_items_are_tensors_of_channels_first(folder):
 def test_pictures_are_the_images_on_the_srgb_curve(folder):
     item = BlurDataset(folder)[0]
     for key, name in (("sharp", "sharp"), ("blurred", "blur")):
-        picture = decode_png((folder / name / "00000000.png").read_bytes())
+        picture = pixels_of(folder / name / "00000000.png")
         linear = item[key].permute(1, 2, 0).double().clamp(0, 1)
         curve = torch.where(linear <= 0.0031308, linear * 12.92, 1.055 * linear ** (1 / 2.4) - 0.055) * 255
         assert np.abs(picture - curve.numpy()).max() < 1.0  # half a step of 8 bits, and half floats' 11 bits
@@ -112,7 +118,7 @@ def test_one_flipped_bit_anywhere_is_found_and_named(folder):
 
 
 def test_the_contact_sheet_shows_every_frame(folder):
-    sheet = decode_png((folder / "contact_sheet.png").read_bytes())
+    sheet = pixels_of(folder / "contact_sheet.png")
     assert sheet.shape[1] >= 5 * 14
     assert sheet.shape[0] >= 5 * 10
     assert sheet.std() > 10

@@ -2,6 +2,7 @@ import hashlib
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import datagen.runs
 from datagen import ManifestError, SpecError, generate, parse_spec, verify_dataset
 from datagen.__main__ import main
 from datagen.manifest import MANIFEST_NAME, read_manifest
-from datagen.writer import TEMPORARY_PREFIX
+from datagen.writer import FOLDERS, TEMPORARY_PREFIX
 
 TINY = {"width": 8, "height": 6, "rays_per_pixel": 1, "frames_per_clip": 2, "seed": 4}
 ROOT = Path(__file__).resolve().parent.parent
@@ -129,16 +130,113 @@ def test_a_manifest_cut_anywhere_in_its_last_line_is_survived(reference, tmp_pat
         assert sums(folder) == sums(reference)
 
 
-def test_damage_elsewhere_in_the_manifest_is_an_error_and_harms_nothing(tmp_path):
+def stamps(folder):
+    """When each frame's files were written, by relative path; a rewrite changes the inode."""
+    files = [p for name in FOLDERS for p in (folder / name).iterdir()]
+    return {p.relative_to(folder).as_posix(): (p.stat().st_ino, p.stat().st_mtime_ns) for p in files}
+
+
+def test_damaged_files_of_the_right_size_are_made_again_and_named(reference, tmp_path, capsys):
     folder = tmp_path / "data"
-    generate(spec(count=2), folder)
-    whole = (folder / MANIFEST_NAME).read_bytes()
-    for damaged in (b"{" + whole, whole[5:], whole + b"[]\n", whole + whole.replace(b'"bytes": ', b'"bytes": 1')):
+    shutil.copytree(reference, folder)
+    for name in ("blur/00000003.png", "frames/00000001.exr"):
+        data = bytearray((folder / name).read_bytes())
+        data[len(data) // 2] ^= 1
+        (folder / name).write_bytes(data)
+    (folder / "sharp/00000003.png").unlink()
+    before = stamps(folder)
+    result = generate(spec(), folder, is_quiet=False)
+    assert result.repaired == (
+        "frame 1: frames/00000001.exr differs from the manifest; made again",
+        "frame 3: sharp/00000003.png is missing, blur/00000003.png differs from the manifest; made again",
+    )
+    told = capsys.readouterr().err
+    assert all(line in told for line in result.repaired)
+    assert (result.made, result.kept, result.is_complete) == (2, 2, True)
+    assert sums(folder) == sums(reference)
+    after = stamps(folder)
+    intact = [name for name in after if Path(name).stem in ("00000000", "00000002")]
+    assert {name: after[name] for name in intact} == {name: before[name] for name in intact}
+    assert generate(spec(), folder).repaired == ()
+
+
+def test_a_file_that_cannot_be_read_is_named(reference, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(reference, folder)
+    (folder / "blur/00000002.png").unlink()
+    (folder / "blur/00000002.png").mkdir()
+    result = generate(spec(), folder)
+    assert [index for index, _ in result.failed] == [2]
+    assert (result.kept, result.repaired) == (3, ())  # it is in the way, so nothing has been made again
+    (folder / "blur/00000002.png").rmdir()
+    assert generate(spec(), folder).is_complete
+    assert sums(folder) == sums(reference)
+
+
+def test_a_damaged_line_of_the_manifest_costs_its_own_frame_only(reference, tmp_path, capsys):
+    whole = (reference / MANIFEST_NAME).read_bytes()
+    lines = whole.splitlines(keepends=True)
+    sum_of_2 = json.loads(lines[2])["files"][0]["sha256"]
+    cases = {  # damage: frames to be made again, what is told of it
+        b"{" + whole: ([0], "line 1"),
+        whole[5:]: ([0], "line 1"),
+        b"".join([lines[0], b"junk\n", *lines[2:]]): ([1], "line 2, got 'junk'"),
+        b"".join([*lines[:2], b"\xff\0" * 900 + b"\n", lines[3]]): ([2], "line 3"),
+        b"".join([*lines[:2], b"[" * 100_000 + b"\n", lines[3]]): ([2], "line 3"),
+        whole + b"[]\n": ([], "line 5, got '[]'"),
+        whole.replace(sum_of_2.encode(), b"0" * 64): ([2], "frame 2: frames/00000002.exr differs"),
+        whole.replace(sum_of_2.encode(), b"x" * 64): ([2], "line 3"),
+        whole.replace(b'"frame": 1, "index": 1', b'"frame": 0, "index": 1'): (
+            [1],
+            "frame 1: its line in manifest.jsonl",
+        ),
+        whole.replace(b'"index": 1', b'"index": 7'): ([1], "line 2"),
+    }
+    for number, (damaged, (lost, told)) in enumerate(cases.items()):
+        folder = tmp_path / str(number)
+        shutil.copytree(reference, folder)
         (folder / MANIFEST_NAME).write_bytes(damaged)
-        with pytest.raises(ManifestError):
-            generate(spec(count=2), folder)
-        assert (folder / MANIFEST_NAME).read_bytes() == damaged
-        assert len(list((folder / "frames").iterdir())) == 2
+        before = stamps(folder)
+        if told.startswith("line"):
+            with pytest.raises(ManifestError, match=told.split(",")[0]):
+                read_manifest(folder)
+        result = generate(spec(), folder, is_quiet=False)
+        after = stamps(folder)
+        assert sorted({int(Path(name).stem) for name in after if after[name] != before[name]}) == lost, told
+        assert (result.made, result.kept, result.is_complete) == (len(lost), 4 - len(lost), True)
+        assert len(result.repaired) == 1
+        assert told in result.repaired[0]
+        assert result.repaired[0] in capsys.readouterr().err
+        assert sums(folder) == sums(reference), told
+
+
+def test_of_two_lines_for_one_frame_the_one_that_fits_its_files_counts(reference, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(reference, folder)
+    whole = (folder / MANIFEST_NAME).read_bytes()
+    other = whole.replace(b'"bytes": ', b'"bytes": 1')
+    for both in (whole + other, other + whole):
+        (folder / MANIFEST_NAME).write_bytes(both)
+        with pytest.raises(ManifestError, match="one entry of frame 0, got two that differ"):
+            read_manifest(folder)
+        result = generate(spec(), folder)
+        assert (result.made, result.kept) == (0, 4)
+        assert [note.split(";")[0] for note in result.repaired] == [
+            f"manifest.jsonl: expected one entry of frame {index}, got two that differ" for index in range(4)
+        ]
+        assert sums(folder) == sums(reference)
+
+
+def test_a_manifest_of_another_configuration_is_refused_and_left_alone(reference, tmp_path):
+    folder = tmp_path / "data"
+    shutil.copytree(reference, folder)
+    place = folder / MANIFEST_NAME
+    mine = json.loads(place.read_bytes().splitlines()[0])["config_sha256"].encode()
+    place.write_bytes(place.read_bytes().replace(mine, b"5" * 64))
+    before = sums(folder)
+    with pytest.raises(SpecError, match=f"out: expected frames of configuration {mine.decode()} .*, got 5555"):
+        generate(spec(), folder)
+    assert sums(folder) == before
 
 
 # One process that forks for every kill point: the k-th fsync or rename kills it before, or after, being done.

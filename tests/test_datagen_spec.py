@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datagen.seeds import open_stream
-from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields, spec_to_toml
+from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields
 
 
 @pytest.mark.parametrize(
@@ -57,11 +57,10 @@ def test_assets_must_exist_and_fit_the_source(tmp_path):
             parse_spec({"source": source, "assets": assets})
 
 
-def test_toml_round_trip(tmp_path):
-    spec = parse_spec({"width": 31, "exposure": 0.25, "seed": 2**62, "source": "meshes", "assets": str(tmp_path)})
+def test_a_toml_file_gives_the_fields(tmp_path):
     path = tmp_path / "run.toml"
-    path.write_text(spec_to_toml(spec), encoding="utf-8")
-    assert parse_spec(read_spec_fields(path)) == spec
+    path.write_text(f'width = 31\nexposure = 0.25\nseed = {2**62}\nassets = "größer"\n', encoding="utf-8")
+    assert read_spec_fields(path) == {"width": 31, "exposure": 0.25, "seed": 2**62, "assets": "größer"}
     path.write_text("width = [", encoding="utf-8")
     with pytest.raises(SpecError, match="config: expected"):
         read_spec_fields(path)

@@ -135,7 +135,7 @@ def plant_background_not_weighted(patch):
     def wrong(result):
         return dataclasses.replace(result, alpha=torch.ones_like(result.alpha))
 
-    patch.setattr(render, "expose_cells", changed(render.expose_cells, wrong))
+    patch.setattr(render, "expose_samples", changed(render.expose_samples, wrong))
 
 
 def plant_segment_times_wrong(patch):
@@ -175,7 +175,7 @@ def plant_coverage_counted_twice(patch):
     def wrong(result):
         return dataclasses.replace(result, coverage=2 * result.coverage)
 
-    patch.setattr(render, "expose_cells", changed(render.expose_cells, wrong))
+    patch.setattr(render, "expose_samples", changed(render.expose_samples, wrong))
 
 
 def plant_ties_by_input_order(patch):

@@ -67,7 +67,9 @@ def test_a_sliding_texture_is_the_mean_over_its_path():
     """A row of texels slides past the pixel: a piecewise linear function, integrated by trapezoids at its bends."""
     texture = image(1, 16, 3, seed=3)
     end = SQUARE + torch.tensor([0.9, 0.0, 0.0], dtype=FLOAT64)
-    mesh = tb.Mesh(torch.stack([SQUARE, end]), FACES, tb.Material(texture=texture, wrap="clamp"), uv=UV)
+    mesh = tb.Mesh(
+        torch.stack([SQUARE, end]), FACES, tb.Material((1.0, 1.0, 1.0), texture=texture, wrap="clamp"), uv=UV
+    )
     got = tb.render(tb.Scene([mesh], flat_camera())).rgba[0, 0, :3]
     u_start, u_end = 0.5, (1 - 0.9) / 2
     bends = [(k + 0.5) / 16 for k in range(16) if u_end < (k + 0.5) / 16 < u_start]

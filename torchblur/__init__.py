@@ -3,6 +3,7 @@
 from torchblur.accuracy import Accuracy
 from torchblur.camera import Camera
 from torchblur.instant import Instant, motion_to, render_instant
+from torchblur.metrics import flip_hdr, flip_ldr, psnr, ssim
 from torchblur.render import Frame, render, render_windows
 from torchblur.sampling import Accumulated, accumulate
 from torchblur.scene import Material, Mesh, Scene
@@ -20,8 +21,12 @@ __all__ = [
     "Scene",
     "Shutter",
     "accumulate",
+    "flip_hdr",
+    "flip_ldr",
     "motion_to",
+    "psnr",
     "render",
     "render_instant",
     "render_windows",
+    "ssim",
 ]

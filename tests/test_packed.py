@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchblur import packed
-from torchblur.sort import argsort_by, inverse, is_tied, reorder_ties
+from torchblur.sort import argsort_by, argsort_descending_in, inverse, is_tied, reorder_ties
 
 COUNTS = [[], [0], [3], [0, 2, 0, 0, 5, 1, 0], [1] * 7]
 
@@ -88,6 +88,18 @@ def test_argsort_is_lexicographic_and_stable():
     order = argsort_by(a, b)
     assert order.tolist() == [1, 3, 2, 0, 4]
     assert inverse(order)[order].tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("spread", [1.0, 1e-9, 1e-14])
+def test_falling_values_within_owners_are_sorted_exactly_however_close(spread, generator):
+    owner = torch.randint(0, 400, (5000,), generator=generator) + 3_000_000  # a joined key keeps 31 bits of the value
+    value = 1.0 + spread * torch.rand(5000, dtype=torch.float64, generator=generator)
+    value[::50] = torch.inf
+    value[1::50] = 1e-12
+    order = argsort_descending_in(owner, value)
+    assert sorted(order.tolist()) == list(range(5000))
+    pairs = list(zip(owner[order].tolist(), (-value[order]).tolist(), strict=True))
+    assert pairs == sorted(pairs)
 
 
 def test_ties_chain_and_are_reordered_by_rank():

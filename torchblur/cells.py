@@ -18,7 +18,7 @@ from torch import Tensor
 from torchblur import bernstein, packed
 from torchblur.intervals import Intervals, attach_gradient, nearness_at
 from torchblur.prisms import Prisms
-from torchblur.sort import argsort_by, inverse, is_tied, reorder_ties
+from torchblur.sort import argsort_by, argsort_descending_in, inverse, is_tied, reorder_ties
 
 CROSSING_NOISE = 1e-12  # of the largest product: smaller coefficients of F are rounding
 MIN_CELL = 1e-12  # of the window: shorter cells are not searched for crossings; a pixel changes by at most as much
@@ -78,22 +78,21 @@ def cut_cells(prisms: Prisms, intervals: Intervals) -> Cells:
     Gradient: to vertices and camera through the times, those of crossings included.
     Source: Ronnow et al. 2021, sec. 4.3.
     """
-    crossings = None
-    with torch.no_grad():
-        pixels = torch.arange(len(intervals.offsets) - 1, device=intervals.prism.device)
-        while True:
-            pending = intervals if crossings is None else intervals.of_pixels(pixels)
-            known = None if crossings is None else _of_pixels(crossings, pixels)
-            found = _find_crossings(prisms, pending, _stack_layers(prisms, pending, known))
-            if len(found.pixel) == 0:
-                break
-            own, _ = packed.select(intervals.offsets, pixels)
-            found = Crossings(pixels[found.pixel], found.t, own[found.pair])
-            crossings = found if crossings is None else _join(crossings, found)
-            pixels = torch.unique(found.pixel)  # only these can hold more: new neighbours in depth
-    if crossings is not None:
-        crossings = _attach(prisms, intervals, crossings)
-    return _pack(intervals, _stack_layers(prisms, intervals, crossings), crossings)
+    layers = _stack_layers(prisms, intervals, None)
+    crossings = found = _find_crossings(prisms, intervals, layers)
+    if len(crossings.pixel) == 0:
+        return _pack(intervals, layers, 0)
+    while len(found.pixel):
+        pixels = torch.unique(found.pixel)  # only these can hold more: they have new neighbours in depth
+        with torch.no_grad():
+            pending = intervals.of_pixels(pixels)
+            layers = _stack_layers(prisms, pending, _of_pixels(crossings, pixels))
+        found = _find_crossings(prisms, pending, layers)
+        own, _ = packed.select(intervals.offsets, pixels)
+        found = Crossings(pixels[found.pixel], found.t, own[found.pair])
+        crossings = _join(crossings, found)
+    crossings = _attach(prisms, intervals, crossings)
+    return _pack(intervals, _stack_layers(prisms, intervals, crossings), len(crossings.pixel))
 
 
 def _instants(intervals: Intervals, crossings: Crossings | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -143,7 +142,7 @@ def _depth_order(
     """
     cell, interval = layers
     nearness = _nearness(intervals, interval, 0.5 * (times[0] + times[1]))
-    order = argsort_by(cell, -nearness)
+    order = argsort_descending_in(cell, nearness)
     tied = is_tied(cell[order], nearness[order])
     if not tied.any():
         return order
@@ -168,7 +167,7 @@ def _local(intervals: Intervals, interval: Tensor, t: Tensor) -> Tensor:
     return ((t - start) / (end - start)).clamp(0, 1)  # rounding only
 
 
-def _pack(intervals: Intervals, layers: _Layers, crossings: Crossings | None) -> Cells:
+def _pack(intervals: Intervals, layers: _Layers, n_crossings: int) -> Cells:
     """Return the visible layers, cells without any left out."""
     seen = (torch.arange(len(layers.cell), device=layers.cell.device) <= layers.last_seen).nonzero().flatten()
     cell, counts = torch.unique_consecutive(layers.cell[seen], return_counts=True)
@@ -178,10 +177,11 @@ def _pack(intervals: Intervals, layers: _Layers, crossings: Crossings | None) ->
         t_end=layers.instant_t[cell + 1],
         layer_offsets=packed.offsets_from_counts(counts),
         layer_interval=layers.interval[seen],
-        n_crossings=0 if crossings is None else len(crossings.pixel),
+        n_crossings=n_crossings,
     )
 
 
+@torch.no_grad()
 def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Crossings:
     """Return the crossings inside the cells between layers whose order matters.
 

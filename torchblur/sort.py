@@ -23,6 +23,23 @@ def argsort_by(*keys: Tensor) -> Tensor:
     return order
 
 
+def argsort_descending_in(owner_of: Tensor, value: Tensor) -> Tensor:
+    """Return the order by owner, then by falling `value` (N,) int64, which must be positive.
+
+    One sort of a joined key, whose rounding may put close values the wrong way round; owners in which that happened
+    are sorted again by the values themselves. Source: ours.
+    """
+    largest = torch.where(torch.isfinite(value), value, 0.0).max() if len(value) else value.sum()
+    share = (value / largest.clamp(min=torch.finfo(value.dtype).tiny)).clamp(max=1.0)
+    order = torch.sort(owner_of + 0.75 * (1 - share), stable=True).indices
+    owner, sorted_value = owner_of[order], value[order]
+    wrong = (owner[1:] == owner[:-1]) & (sorted_value[1:] > sorted_value[:-1])
+    if wrong.any():
+        again = torch.isin(owner, owner[1:][wrong]).nonzero().flatten()
+        order[again] = order[again][argsort_by(owner[again], -sorted_value[again])]
+    return order
+
+
 def inverse(order: Tensor) -> Tensor:
     """Return where each value went, so that `inverse(order)[order]` counts up. Source: ours."""
     place = torch.zeros_like(order)

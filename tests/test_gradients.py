@@ -204,7 +204,7 @@ def test_float32_gradients_are_finite_and_those_of_float64(name):
         scene = make.to_torch(plain, torch.float32)
         vertices = [m.vertices.to(dtype).requires_grad_() for m in scene.meshes]
         meshes = [
-            tb.Mesh(v, m.faces, tb.Material(m.material.color, m.material.opacity, m.material.double_sided))
+            tb.Mesh(v, m.faces, tb.Material(m.material.color, m.material.opacity, double_sided=m.material.double_sided))
             for v, m in zip(vertices, scene.meshes, strict=True)
         ]
         image = tb.render(tb.Scene(meshes, scene.camera, scene.background)).rgba

@@ -37,9 +37,9 @@ class Material:
 
     color: Any = (0.8, 0.8, 0.8)
     opacity: Any = 1.0
-    double_sided: bool = True
-    texture: Any = None
-    wrap: str = "repeat"
+    double_sided: bool = field(default=True, kw_only=True)
+    texture: Any = field(default=None, kw_only=True)
+    wrap: str = field(default="repeat", kw_only=True)
 
     def __post_init__(self) -> None:
         color = check.floats("color", self.color, (3,), ("F", 3))
@@ -78,8 +78,8 @@ class Mesh:
     vertices: Any
     faces: Any
     material: Material = field(default_factory=Material)
-    name: str = "mesh"
-    uv: Any = None
+    name: str = field(default="mesh", kw_only=True)
+    uv: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):

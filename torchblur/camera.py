@@ -227,6 +227,9 @@ def clip_to_px(clip: Tensor, width: int, height: int) -> Tensor:
     return torch.where(in_front.unsqueeze(-1), torch.stack([x_px, y_px], dim=-1), torch.nan)
 
 
+MAX_RAYS = 4096  # a pixel
+
+
 def pixel_rays(n: int) -> list[tuple[float, float]]:
     """Return `n` places inside the pixel, (x, y) in [0, 1): the centre for 1, else Hammersley points about the centre.
 

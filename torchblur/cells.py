@@ -1,6 +1,6 @@
 """Cut each ray's time into cells: within a cell the same surfaces cover the ray, in one fixed order of depth.
 
-Before: intervals.py, sort.py.  After: resolve.py.
+Before: intervals.py, sort.py.  After: nodes.py, resolve.py.
 Symbols: N intervals, X crossings, C cells, L layers (one interval in one cell); F = M_i D_j - M_j D_i has the sign of
 nearness_i - nearness_j (both D have one sign over their interval).
 Source: Ronnow et al. 2021, sec. 4.3 and alg. 1 (the event sweep), as tensor operations. Differs: any number of

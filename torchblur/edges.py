@@ -64,14 +64,21 @@ def edges_of(x: Tensor, y: Tensor) -> Tensor:
     return torch.stack([s * cross(x[i], y[i], x[j], y[j]) for i, j, s in zip(FIRST, SECOND, EDGE_SIGN, strict=True)])
 
 
+def polar_edges(x: Tensor, y: Tensor, dx: Tensor, dy: Tensor) -> Tensor:
+    """Return A_j x dA_k + dA_j x A_k (3, m): the slope of e at corners x, y (3, m) that move by dx, dy. Ours."""
+    return torch.stack(
+        [
+            s * (cross(x[i], y[i], dx[j], dy[j]) + cross(dx[i], dy[i], x[j], y[j]))
+            for i, j, s in zip(FIRST, SECOND, EDGE_SIGN, strict=True)
+        ]
+    )
+
+
 def edge_coefficients(corners: Corners) -> Tensor:
     """Return the Bernstein coefficients (3 coefficients, 3 edges, m) of the e_i on the corners' slice. Ours."""
     x, y = corners.x, corners.y
-    middle = [
-        s * 0.5 * (cross(x[0, i], y[0, i], x[1, j], y[1, j]) + cross(x[1, i], y[1, i], x[0, j], y[0, j]))
-        for i, j, s in zip(FIRST, SECOND, EDGE_SIGN, strict=True)
-    ]
-    return torch.stack([edges_of(x[0], y[0]), torch.stack(middle), edges_of(x[1], y[1])])
+    middle = 0.5 * polar_edges(x[0], y[0], x[1], y[1])
+    return torch.stack([edges_of(x[0], y[0]), middle, edges_of(x[1], y[1])])
 
 
 def edge_roots(corners: Corners) -> Tensor:

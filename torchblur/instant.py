@@ -13,14 +13,12 @@ import torch
 from torch import Tensor
 
 from torchblur import check, packed
-from torchblur.camera import clip_to_px, pixel_rays
+from torchblur.camera import MAX_RAYS, clip_to_px, pixel_rays
 from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
 from torchblur.shading import look
 from torchblur.surfaces import Surfaces, build_surfaces
 from torchblur.texture import to_texels
-
-MAX_RAYS = 4096
 
 
 @dataclass(frozen=True)

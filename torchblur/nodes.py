@@ -9,7 +9,7 @@ Source: Ronnow et al. 2022, eq. 1 (the quadratics); panels between texel lines a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -56,12 +56,11 @@ def place_samples(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tup
     """
     middle = 0.5 * (cells.t_start + cells.t_end)
     every = torch.arange(len(middle), device=middle.device)
-    flat = Samples(every, middle, torch.ones_like(middle.detach()), torch.ones_like(every, dtype=torch.bool))
     with torch.no_grad():
         layer_face = prisms.face_of[intervals.prism[cells.layer_interval]]
         layer = prisms.surfaces.is_textured[layer_face].nonzero().flatten()
         if len(layer) == 0:
-            return flat
+            return Samples(every, middle, torch.ones_like(middle), torch.ones_like(every, dtype=torch.bool))
         cell = packed.owners(cells.layer_offsets)[layer]
         varying = torch.unique(cell)
         textured = _Textured.of(prisms, intervals, cells, (cell, cells.layer_interval[layer]))
@@ -77,17 +76,16 @@ def place_samples(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tup
             tau = start + (end - start) * (0.5 * (place.unsqueeze(1) + 1))
             share = (end - start) * 0.5 * weight.unsqueeze(1)
             parts.append((owner.repeat(n), tau.flatten(), share.flatten()))
-        owner, tau, share = (torch.cat(p) for p in zip(*parts, strict=True))
         is_varying = torch.zeros_like(every, dtype=torch.bool)
         is_varying[varying] = True
         rest = (~is_varying).nonzero().flatten()
-        order = argsort_by(torch.cat([owner, rest]), torch.cat([tau, torch.full_like(middle[rest], 0.5)]))
-        is_flat = torch.cat([torch.zeros_like(owner, dtype=torch.bool), torch.ones_like(rest, dtype=torch.bool)])
-        owner = torch.cat([owner, rest])[order]
-        tau = torch.cat([tau, torch.full_like(middle[rest], 0.5)])[order]
-        share = torch.cat([share, torch.ones_like(middle[rest])])[order]
+        one = torch.ones_like(middle[rest])
+        parts.append((rest, 0.5 * one, one))
+        owner, tau, share = (torch.cat(p) for p in zip(*parts, strict=True))
+        order = argsort_by(owner, tau)
+        owner, tau, share = owner[order], tau[order], share[order]
     t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
-    return replace(flat, cell=owner, t=t, share=share, is_flat=is_flat[order])
+    return Samples(owner, t, share, ~is_varying[owner])
 
 
 def count_nodes(prisms: Prisms, intervals: Intervals, cells: Cells) -> int:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchblur.camera import clip_to_px
 from torchblur.scene import Mesh, Scene
 from torchblur.surfaces import Surfaces
 
@@ -129,9 +130,8 @@ def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tenso
         is_clipped = ((near < 0) | (far < 0)).any(0).any(0)
         kept = (~outside).nonzero().flatten()
         has_hull = ((near >= 0) & (clip[:, :, 3] > 0)).all(0).all(0)
-        w = torch.where(has_hull, clip[:, :, 3], 1.0)
-        x_px, y_px = (clip[:, :, 0] / w + 1) * (width / 2), (1 - clip[:, :, 1] / w) * (height / 2)
-        corners_px = torch.where(has_hull, torch.stack([x_px, y_px]).flatten(1, 2), torch.nan)
+        corners_px = clip_to_px(clip.movedim(2, -1), width, height).movedim(-1, 0).flatten(1, 2)
+        corners_px = torch.where(has_hull, corners_px, torch.nan)
     order = corner_of[:, kept].reshape(1, 3, 1, -1).expand(2, 3, 4, -1)
     one = torch.ones(len(kept), dtype=torch.float64, device=clip.device)
     return (

@@ -1,6 +1,6 @@
 """Render the exact mean of a scene over its exposure, block of pixels by block of pixels.
 
-Before: prisms.py, intervals.py, cells.py, resolve.py.  After: the user.
+Before: prisms.py, intervals.py, cells.py, nodes.py, resolve.py.  After: the user.
 Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
 """
 
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchblur import check, packed
 from torchblur.accuracy import Accuracy
-from torchblur.camera import pixel_rays
+from torchblur.camera import MAX_RAYS, pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
 from torchblur.nodes import count_nodes, place_samples
@@ -28,10 +28,9 @@ from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
-BYTES_PER_LAYER = 260  # peak of cut_cells and resolve_cells
-BYTES_PER_NODE = 500  # peak of place_samples and composite_samples, a layer
+BYTES_PER_LAYER = 260  # peak of cut_cells, a layer
+BYTES_PER_NODE = 500  # peak of place_samples and composite_samples, a layer of a sample
 MIN_MEMORY_BYTES = 1 << 20
-MAX_RAYS = 4096
 COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "nodes", "deepest_pixel")
 STAGES = ("prisms", "intervals", "cells", "resolve")
 

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from torchblur import check
-from torchblur.camera import pixel_rays
-from torchblur.instant import MAX_RAYS, sum_of_instants
+from torchblur.camera import MAX_RAYS, pixel_rays
+from torchblur.instant import sum_of_instants
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces

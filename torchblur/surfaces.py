@@ -1,6 +1,6 @@
 """What the faces of a scene look like, all meshes end to end, and which of two coplanar ones is in front.
 
-Before: scene.py.  After: prisms.py, instant.py.
+Before: scene.py.  After: prisms.py, fragments.py, texture.py.
 Symbols: F faces of all meshes.
 """
 

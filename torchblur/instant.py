@@ -16,7 +16,7 @@ from torchblur import check, packed
 from torchblur.camera import MAX_RAYS, clip_to_px, pixel_rays
 from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
-from torchblur.shading import look
+from torchblur.shading import look, textured_among
 from torchblur.surfaces import Surfaces, build_surfaces
 from torchblur.texture import to_texels
 
@@ -69,7 +69,7 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
     for fragments in find_fragments(scene, surfaces, at, (0.5, 0.5)):
-        _, alpha = look(surfaces, fragments.face, _texels(surfaces, fragments))
+        _, alpha = _look(surfaces, fragments)
         seen = (alpha.detach() > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
         first = seen[packed.offsets_from_counts(count)[:-1]]
@@ -169,7 +169,7 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
     for fragments in find_fragments(scene, surfaces, t, ray_px):
-        rgb, alpha = look(surfaces, fragments.face, _texels(surfaces, fragments))
+        rgb, alpha = _look(surfaces, fragments)
         before, after = packed.transmittance(alpha, fragments.offsets)
         light = (before * alpha).unsqueeze(1) * rgb
         rgba = torch.cat([packed.sum_by_owner(light, fragments.offsets), (1 - after).unsqueeze(1)], dim=1)
@@ -177,9 +177,9 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     return total.reshape(camera.height, camera.width, 4)
 
 
-def _texels(surfaces: Surfaces, fragments: Fragments) -> Tensor | None:
-    """Return (2, n) places on the textures, None if no face has one."""
-    if not surfaces.is_textured[fragments.face].any():
-        return None
-    uv = torch.einsum("kn,nkc->cn", fragments.bary, surfaces.uv[fragments.face])
-    return to_texels(surfaces, fragments.face, uv)
+def _look(surfaces: Surfaces, fragments: Fragments) -> tuple[Tensor, Tensor]:
+    """Return straight colour (n, 3) and opacity (n,) of the fragments."""
+    face = fragments.face
+    textured = textured_among(surfaces, face)
+    uv = torch.einsum("kn,nkc->cn", fragments.bary[:, textured], surfaces.uv[face[textured]])
+    return look(surfaces, face, textured, to_texels(surfaces, face[textured], uv))

@@ -18,7 +18,7 @@ from torchblur.cells import Cells
 from torchblur.intervals import Intervals
 from torchblur.nodes import Samples
 from torchblur.prisms import Prisms
-from torchblur.shading import look, texels_on_prisms
+from torchblur.shading import look, texels_on_prisms, textured_among
 from torchblur.shutter import Shutter
 
 
@@ -60,11 +60,10 @@ def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, sample
     surfaces, interval = prisms.surfaces, cells.layer_interval[layer]
     prism = intervals.prism[interval]
     face = prisms.face_of[prism]
-    texel = None
-    if surfaces.is_textured[face].any():
-        ray = intervals.ray_ndc[:, packed.owners(intervals.offsets)[interval]]
-        texel = texels_on_prisms(prisms, prism, ray, samples.t[sample])
-    rgb, alpha = look(surfaces, face, texel)
+    textured = textured_among(surfaces, face)
+    ray = intervals.ray_ndc[:, packed.owners(intervals.offsets)[interval[textured]]]
+    texel = texels_on_prisms(prisms, prism[textured], ray, samples.t[sample[textured]])
+    rgb, alpha = look(surfaces, face, textured, texel)
     before, after = packed.transmittance(alpha, offsets, cutoff)
     light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
     n_meshes = max(1, len(surfaces.first_face))

@@ -16,23 +16,28 @@ from torchblur.surfaces import Surfaces
 from torchblur.texture import lookup, to_texels
 
 
-def look(surfaces: Surfaces, face: Tensor, texel: Tensor | None) -> tuple[Tensor, Tensor]:
+def textured_among(surfaces: Surfaces, face: Tensor) -> Tensor:
+    """Return the indices of the faces `face` (K,) that have a texture. Ours."""
+    return surfaces.is_textured[face].nonzero().flatten()
+
+
+def look(surfaces: Surfaces, face: Tensor, textured: Tensor, texel: Tensor) -> tuple[Tensor, Tensor]:
     """Return straight colour (K, 3) and opacity (K,) of points on `face` (K,).
 
     Args:
         surfaces: appearance of the faces.
         face: (K,) int64.
-        texel: (2, K) places on their textures; None if no face has one.
+        textured: (J,) of `textured_among`.
+        texel: (2, J) places of these on their textures.
 
     Gradient: to colour, opacity, texture, and through `texel`.
     Source: ours.
     """
     rgb, alpha = surfaces.rgb[face], surfaces.opacity[face]
-    if texel is None:
+    if len(textured) == 0:
         return rgb, alpha
-    textured = surfaces.is_textured[face].nonzero().flatten()
     rgba = torch.cat([rgb, alpha.unsqueeze(1)], dim=1)
-    rgba = rgba.index_put((textured,), rgba[textured] * lookup(surfaces, face[textured], texel[:, textured]))
+    rgba = rgba.index_put((textured,), rgba[textured] * lookup(surfaces, face[textured], texel))
     return rgba[:, :3], rgba[:, 3]
 
 

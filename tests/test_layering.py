@@ -16,18 +16,21 @@ import pytest
 import torchblur
 
 ROOT = Path(__file__).resolve().parents[1]
-# lowest first; surfaces, bernstein and accuracy came later than the design's list and stand where they are used
+# lowest first; the design's list, finer
 TORCHBLUR = [
     "check",
     "packed",
     "shutter",
     "accuracy",
+    "bernstein",
     "camera",
+    "lights",
+    "material",
     "scene",
+    "atlas",
     "surfaces",
     "effects",
     "prisms",
-    "bernstein",
     "edges",
     "pairs",
     "intervals",
@@ -35,7 +38,11 @@ TORCHBLUR = [
     "sort",
     "cells",
     "texture",
+    "lighting",
     "shading",
+    "paths",
+    "texture_bends",
+    "light_bends",
     "nodes",
     "shadows",
     "resolve",

@@ -7,6 +7,7 @@ import torch
 
 import torchblur as tb
 from torchblur import edges
+from torchblur.camera import CENTRE
 from torchblur.intervals import find_intervals
 from torchblur.pairs import Block
 from torchblur.prisms import build_prisms, canonical_corners, swept_bounds_px, window_times
@@ -102,10 +103,10 @@ def test_no_ray_inside_the_bounds_is_forgotten_in_any_block(generator):
     scene, shutter = scene_with(1, 0)
     prisms = build_prisms(scene, build_surfaces(scene), (shutter.t_open, shutter.t_close))
     every = torch.arange(prisms.count)
-    whole, _ = find_intervals(prisms, Block(0, 0, 8, 8, (0.5, 0.5), 8, 8), every)
+    whole, _ = find_intervals(prisms, Block(0, 0, 8, 8, CENTRE, 8, 8), every)
     parts = []
     for y0, x0 in itertools.product((0, 3), (0, 5)):
-        block = Block(x0, y0, 5 if x0 == 0 else 3, 3 if y0 == 0 else 5, (0.5, 0.5), 8, 8)
+        block = Block(x0, y0, 5 if x0 == 0 else 3, 3 if y0 == 0 else 5, CENTRE, 8, 8)
         part, _ = find_intervals(prisms, block, every)
         parts.append((block, part))
     total = 0

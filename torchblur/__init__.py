@@ -3,10 +3,12 @@
 from torchblur.accuracy import Accuracy
 from torchblur.camera import Camera
 from torchblur.instant import Instant, motion_to, render_instant
+from torchblur.lights import DirectionalLight, PointLight, SpotLight
+from torchblur.material import Material
 from torchblur.metrics import flip_hdr, flip_ldr, psnr, ssim
 from torchblur.render import Frame, render, render_windows
 from torchblur.sampling import Accumulated, accumulate
-from torchblur.scene import Material, Mesh, Scene
+from torchblur.scene import Mesh, Scene
 from torchblur.shutter import Shutter
 
 __version__ = "0.1.0"
@@ -14,12 +16,15 @@ __all__ = [
     "Accumulated",
     "Accuracy",
     "Camera",
+    "DirectionalLight",
     "Frame",
     "Instant",
     "Material",
     "Mesh",
+    "PointLight",
     "Scene",
     "Shutter",
+    "SpotLight",
     "accumulate",
     "flip_hdr",
     "flip_ldr",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -76,6 +76,12 @@ class Camera:
         slope = (row_z[..., :3] * row_w[..., :3]).sum(-1) / row_w[..., :3].square().sum(-1)
         offset = row_z[..., 3] - slope * row_w[..., 3]
         return self.is_perspective and bool(((slope > 1 - AFFINE) & (slope <= 3) & (offset < 0)).all())
+
+    @property
+    def handedness(self) -> float:
+        """+1 where what turns counter-clockwise on screen does so seen from the eye, -1 in a mirrored image."""
+        matrix = self.world_to_clip.detach().to(torch.float64).reshape(-1, 4, 4)[0]
+        return -1.0 if torch.linalg.det(matrix) > 0 else 1.0  # view space is right-handed, NDC left-handed
 
     def world_to_clip_at(self, t: Tensor) -> Tensor:
         """Return (N, 4, 4) float64 matrices at the shutter times `t` (N,): linear between the knots."""
@@ -230,15 +236,26 @@ def clip_to_px(clip: Tensor, width: int, height: int) -> Tensor:
 MAX_RAYS = 4096  # a pixel
 
 
-def pixel_rays(n: int) -> list[tuple[float, float]]:
-    """Return `n` places inside the pixel, (x, y) in [0, 1): the centre for 1, else Hammersley points about the centre.
+class Ray(NamedTuple):
+    """The place of a ray inside its pixel, and the side of the square that it stands for."""
+
+    x_px: float
+    y_px: float
+    spacing_px: float
+
+
+CENTRE = Ray(0.5, 0.5, 1.0)
+
+
+def pixel_rays(n: int) -> list[Ray]:
+    """Return `n` places inside the pixel, in [0, 1): the centre for 1, else Hammersley points about the centre.
 
     The set's mean is the centre exactly, so that no image is shifted. Source: the Hammersley point set.
     """
     xs = [(k + 0.5) / n for k in range(n)]
     ys = [_radical_inverse(k) for k in range(n)]
     mean = sum(ys) / n
-    return [(x, y - mean + 0.5) for x, y in zip(xs, ys, strict=True)]
+    return [Ray(x, y - mean + 0.5, n**-0.5) for x, y in zip(xs, ys, strict=True)]
 
 
 def _radical_inverse(k: int) -> float:

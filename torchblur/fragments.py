@@ -17,7 +17,9 @@ import torch
 from torch import Tensor
 
 from torchblur import packed
+from torchblur.camera import Ray
 from torchblur.scene import Scene
+from torchblur.shading import weight_slopes
 from torchblur.sort import argsort_by, is_tied, reorder_ties
 from torchblur.surfaces import Surfaces
 
@@ -33,16 +35,19 @@ class Fragments:
     face: Tensor  # (n,) int64 face of the scene
     bary: Tensor  # (3, n) float64
     depth_view: Tensor  # (n,) float64
+    side: Tensor  # (n,) float64 +1 where the face turns counter-clockwise on screen, else -1
+    slope: Tensor  # (2, 3, n) float64 change of `bary` from one ray to the next along x and y; (2, 3, 0) without mips
+    t: Tensor  # (n,) float64 shutter time
 
 
-def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[float, float]) -> Iterator[Fragments]:
+def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray: Ray) -> Iterator[Fragments]:
     """Yield what the rays of all pixels see at the instants `t` (B,), some instants or a rectangle of pixels at a time.
 
     Args:
         scene: what to look at.
         surfaces: of its faces; those of opacity 0 are left out unless opacity asks for gradients.
         t: shutter times.
-        ray_px: place of the ray inside each pixel.
+        ray: place of the ray inside each pixel.
 
     Source: Olano & Greer 1997.
     """
@@ -51,13 +56,13 @@ def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray_px: tuple[fl
     if not parts:
         return
     clip = torch.cat(parts, dim=1)  # (B, F, 3, 4)
-    box = _boxes(clip.detach().flatten(0, 1), camera.width, camera.height, ray_px).reshape(4, *clip.shape[:2])
+    box = _boxes(clip.detach().flatten(0, 1), camera.width, camera.height, ray).reshape(4, *clip.shape[:2])
     if not surfaces.opacity.requires_grad:
         box[2] = torch.where(surfaces.opacity > 0, box[2], -1)
     for instants, rectangle in _portions(box, (0, len(t)), (0, 0, camera.width - 1, camera.height - 1)):
         clipped = _clip_boxes(box[:, slice(*instants)], rectangle).flatten(1)
         triangles = clip[slice(*instants)].flatten(0, 1)
-        yield _rasterise(scene, surfaces, (triangles, clipped), (t, instants[0], ray_px))
+        yield _rasterise(scene, surfaces, (triangles, clipped), (t, instants[0], ray))
 
 
 def _portions(
@@ -92,7 +97,7 @@ def _clip_boxes(box: Tensor, rectangle: tuple[int, int, int, int]) -> Tensor:
     return torch.cat([low, torch.maximum(high, low - 1)])
 
 
-def _boxes(clip: Tensor, width: int, height: int, ray_px: tuple[float, float]) -> Tensor:
+def _boxes(clip: Tensor, width: int, height: int, ray: Ray) -> Tensor:
     """Return x0 y0 x1 y1 (4, T) int64, inclusive, of the pixels that a triangle (T, 3, 4) may cover."""
     near = clip[..., 2] + clip[..., 3]
     points, valid = [clip], [near >= 0]
@@ -108,7 +113,7 @@ def _boxes(clip: Tensor, width: int, height: int, ray_px: tuple[float, float]) -
     w = w.clamp(min=MIN_W)
     first, last = [], []
     for axis, size, sign in ((0, width, 1), (1, height, -1)):
-        place = (sign * point[..., axis] / w + 1) * (size / 2) - ray_px[axis]
+        place = (sign * point[..., axis] / w + 1) * (size / 2) - ray[axis]
         low = torch.where(ok, place, torch.inf).amin(1)
         high = torch.where(ok, place, -torch.inf).amax(1)
         low = torch.where(everywhere, -torch.inf, low - 1e-6).clamp(0, size).ceil()
@@ -122,11 +127,11 @@ def _rasterise(
     scene: Scene,
     surfaces: Surfaces,
     triangles: tuple[Tensor, Tensor],
-    instants: tuple[Tensor, int, tuple[float, float]],
+    instants: tuple[Tensor, int, Ray],
 ) -> Fragments:
     """Return the fragments of triangles (T, 3, 4) in their boxes (4, T), from instant `instants[1]` on."""
     clip, box = triangles
-    t, first_instant, ray_px = instants
+    t, first_instant, ray = instants
     camera = scene.camera
     n_faces, n_pixels = len(surfaces.opacity), camera.width * camera.height
     n_columns = box[2] - box[0] + 1
@@ -134,15 +139,16 @@ def _rasterise(
     local, triangle = packed.expand(torch.zeros_like(count), count)
     column = box[0][triangle] + local % n_columns[triangle]
     row = box[1][triangle] + local // n_columns[triangle]
-    x_ndc = 2 * (column.to(torch.float64) + ray_px[0]) / camera.width - 1
-    y_ndc = 1 - 2 * (row.to(torch.float64) + ray_px[1]) / camera.height
+    x_ndc = 2 * (column.to(torch.float64) + ray.x_px) / camera.width - 1
+    y_ndc = 1 - 2 * (row.to(torch.float64) + ray.y_px) / camera.height
     sign = _inside(clip.detach(), triangle, (x_ndc, y_ndc))
     front_only = surfaces.is_one_sided[triangle % n_faces]
     kept = ((sign != 0) & ~(front_only & (sign < 0))).nonzero().flatten()
-    triangle, row, column, x_ndc, y_ndc = (a[kept] for a in (triangle, row, column, x_ndc, y_ndc))
+    triangle, row, column, x_ndc, y_ndc, sign = (a[kept] for a in (triangle, row, column, x_ndc, y_ndc, sign))
     corner = clip[triangle]  # (n, 3, 4)
     z, w = corner[..., 2].T, corner[..., 3].T
-    e = _edge_values(corner[..., 0].T - x_ndc * w, corner[..., 1].T - y_ndc * w)
+    x, y = corner[..., 0].T - x_ndc * w, corner[..., 1].T - y_ndc * w
+    e = _edge_values(x, y)
     bary = e / e.sum(0)
     z_hit, w_hit = (bary * z).sum(0), (bary * w).sum(0)
     kept = ((z_hit + w_hit >= 0) & (w_hit - z_hit >= 0) & torch.isfinite(bary).all(0)).nonzero().flatten()
@@ -158,8 +164,20 @@ def _rasterise(
     if not camera.is_perspective:
         scale = camera.world_to_clip_at(t)[instant][:, 2, :3].norm(dim=1)
         depth = camera.depth_at_near + (z_hit / w_hit + 1) / scale
-    offsets = packed.offsets_from_owners(owner[order], len(t) * n_pixels)
-    return Fragments(offsets, face[order], bary[:, kept][:, order], depth[order])
+    slope = bary.new_zeros(2, 3, 0)
+    if surfaces.has_mipmaps:
+        step = 2 * ray.spacing_px / camera.width, -2 * ray.spacing_px / camera.height
+        slopes = _edge_values(y, w), _edge_values(w, x)
+        slope = weight_slopes(e, slopes, step).detach()[..., kept][..., order]
+    return Fragments(
+        offsets=packed.offsets_from_owners(owner[order], len(t) * n_pixels),
+        face=face[order],
+        bary=bary[:, kept][:, order],
+        depth_view=depth[order],
+        side=sign[kept][order].to(torch.float64),
+        slope=slope,
+        t=t[instant[order]],
+    )
 
 
 def _edge_values(x: Tensor, y: Tensor) -> Tensor:

@@ -13,12 +13,11 @@ import torch
 from torch import Tensor
 
 from torchblur import check, packed
-from torchblur.camera import MAX_RAYS, clip_to_px, pixel_rays
+from torchblur.camera import CENTRE, MAX_RAYS, Ray, clip_to_px, pixel_rays
 from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
-from torchblur.shading import look, textured_among
+from torchblur.shading import Points, look, needing_points
 from torchblur.surfaces import Surfaces, build_surfaces
-from torchblur.texture import to_texels
 
 
 @dataclass(frozen=True)
@@ -68,8 +67,8 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     face = torch.full((n_pixels,), -1, dtype=torch.int64, device=device)
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
-    for fragments in find_fragments(scene, surfaces, at, (0.5, 0.5)):
-        _, alpha = _look(surfaces, fragments)
+    for fragments in find_fragments(scene, surfaces, at, CENTRE):
+        _, alpha = _look(scene, surfaces, fragments)
         seen = (alpha.detach() > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
         first = seen[packed.offsets_from_counts(count)[:-1]]
@@ -153,7 +152,7 @@ def _displacement_px(scene: Scene, visible: tuple[Tensor, Tensor, Tensor], t: fl
     return out
 
 
-def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor, ray_px: tuple[float, float]) -> Tensor:
+def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor, ray: Ray) -> Tensor:
     """Return (H, W, 4) float64, the weighted sum of the meshes' premultiplied colour and opacity at the instants.
 
     Args:
@@ -161,15 +160,15 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
         surfaces: of its faces.
         t: (B,) shutter times.
         weight: (B, H * W) or (B, 1).
-        ray_px: place of the ray inside each pixel.
+        ray: place of the ray inside each pixel.
 
     Source: ours.
     """
     camera = scene.camera
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
-    for fragments in find_fragments(scene, surfaces, t, ray_px):
-        rgb, alpha = _look(surfaces, fragments)
+    for fragments in find_fragments(scene, surfaces, t, ray):
+        rgb, alpha = _look(scene, surfaces, fragments)
         before, after = packed.transmittance(alpha, fragments.offsets)
         light = (before * alpha).unsqueeze(1) * rgb
         rgba = torch.cat([packed.sum_by_owner(light, fragments.offsets), (1 - after).unsqueeze(1)], dim=1)
@@ -177,9 +176,39 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     return total.reshape(camera.height, camera.width, 4)
 
 
-def _look(surfaces: Surfaces, fragments: Fragments) -> tuple[Tensor, Tensor]:
+def _look(scene: Scene, surfaces: Surfaces, fragments: Fragments) -> tuple[Tensor, Tensor]:
     """Return straight colour (n, 3) and opacity (n,) of the fragments."""
-    face = fragments.face
-    textured = textured_among(surfaces, face)
-    uv = torch.einsum("kn,nkc->cn", fragments.bary[:, textured], surfaces.uv[face[textured]])
-    return look(surfaces, face, textured, to_texels(surfaces, face[textured], uv))
+    which = needing_points(surfaces, fragments.face)
+    face, t = fragments.face[which], fragments.t[which]
+    world = normal = fragments.bary.new_zeros(3, 3, 0)
+    if surfaces.is_lit[face].any():
+        world, normal = _corners_world(scene, surfaces, face, t)
+    mips = which if fragments.slope.shape[-1] else which[:0]
+    one = torch.ones_like(t)
+    points = Points(
+        face=face,
+        weight=fragments.bary[:, which],
+        slope=fragments.slope[..., mips],
+        uv=surfaces.uv[face].permute(2, 1, 0),
+        world=world,
+        normal=normal,
+        turn=one,
+        side=fragments.side[which],
+        t=t,
+    )
+    return look(surfaces, fragments.face, which, points)
+
+
+def _corners_world(scene: Scene, surfaces: Surfaces, face: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+    """Return positions and normals (3 corners, 3, n) of the corners of `face` (n,) at shutter times `t` (n,)."""
+    times, place = torch.unique(t, return_inverse=True)
+    mesh_of = surfaces.mesh_of[face]
+    world = torch.zeros(len(face), 3, 3, dtype=torch.float64, device=face.device)
+    normal = world
+    for i in torch.unique(mesh_of).tolist():
+        mesh, own = scene.meshes[i], (mesh_of == i).nonzero().flatten()
+        corner = mesh.faces[face[own] - surfaces.first_face[i]]
+        instant = place[own].unsqueeze(1)
+        world = world.index_put((own,), mesh.vertices_at(times)[instant, corner])
+        normal = normal.index_put((own,), mesh.normals_at(times)[instant, corner])
+    return world.permute(1, 2, 0), normal.permute(1, 2, 0)

@@ -35,11 +35,16 @@ class Intervals:
     near_num: Tensor  # (4, N) float64 Bernstein coefficients of M over the interval; no gradient
     near_den: Tensor  # (4, N) float64 of D
     ray_ndc: Tensor  # (2, pixels) float64
+    spacing_ndc: tuple[float, float]  # from one ray to the next, along x and y
 
     @property
     def count(self) -> int:
         """Number of intervals."""
         return len(self.prism)
+
+    def pixel_of(self, interval: Tensor) -> Tensor:
+        """Return the pixel of each `interval` (K,)."""
+        return packed.owners(self.offsets)[interval]
 
     def of_pixels(self, pixels: Tensor) -> Intervals:
         """Return the intervals of `pixels` (C,), which become pixels 0 to C - 1."""
@@ -52,6 +57,7 @@ class Intervals:
             near_num=self.near_num[:, chosen],
             near_den=self.near_den[:, chosen],
             ray_ndc=self.ray_ndc[:, pixels],
+            spacing_ndc=self.spacing_ndc,
         )
 
 
@@ -103,7 +109,16 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
         t_end = _attach(prisms, prism, ray, (t_end, u_end, kind_end))
     all_pixels = torch.arange(block.n_pixels, device=prism.device)
     offsets = packed.offsets_from_owners(pixel, block.n_pixels)
-    return Intervals(offsets, prism, t_start, t_end, near_num, near_den, block.ray_ndc(all_pixels)), n_pairs
+    return Intervals(
+        offsets=offsets,
+        prism=prism,
+        t_start=t_start,
+        t_end=t_end,
+        near_num=near_num,
+        near_den=near_den,
+        ray_ndc=block.ray_ndc(all_pixels),
+        spacing_ndc=block.spacing_ndc,
+    ), n_pairs
 
 
 def nearness_coefficients(prisms: Prisms, prism: Tensor, corners: Corners, u: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,33 +1,45 @@
-"""Choose the times at which the cells of a ray are looked at: one for a flat cell, Gauss's nodes where texture moves.
+"""Choose the times at which the cells of a ray are looked at: one for a flat cell, Gauss's nodes where looks vary.
 
-Before: cells.py, shading.py.  After: resolve.py.
-Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), p panels (slices of a cell in
-which no lookup bends), K pairs of a panel or cell and one of its textured layers; tau in [0, 1] is time in the cell;
-texel place = P / Q with quadratics P and Q = S (sum of edge functions).
-Source: Ronnow et al. 2022, eq. 1 (the quadratics); panels between texel lines and Gauss-Legendre nodes: ours.
+Before: texture_bends.py, light_bends.py.  After: resolve.py.
+Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), spans (see paths.py), p
+panels (slices of a span in which no look bends), n nodes of a panel, d the degree of a look in texels; q vectors of
+polynomials that looks divide by: S, footprints, normals, vectors to lights.
+
+Certificate: on a panel, look at q through its Chebyshev coefficients c_0, c_1, ... On the ellipse about the panel
+whose semi-axes add up to rho, q leaves c_0 by at most sum_k>0 |c_k| (rho^k + rho^-k) / 2. Where that is a set share of
+|c_0| for all q, the looks are analytic inside the ellipse and grow by at most (1 + rho / 2)^d, and Gauss's rule errs by
+at most BOUND (1 + rho / 2)^d rho^(-2 n) (Trefethen, theorem 19.3). Panels get the fewest nodes for which that is below
+TOLERANCE; those for which the most do not suffice are halved.
+Source: Trefethen 2013, Approximation Theory and Approximation Practice (Gauss's rule on analytic functions); ours.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchblur import bernstein, edges, packed
+from torchblur import bernstein, packed
 from torchblur.cells import Cells
 from torchblur.intervals import Intervals
+from torchblur.light_bends import LightPaths
+from torchblur.paths import Paths, between, cut_spans, follow
 from torchblur.prisms import Prisms
-from torchblur.shading import corner_uv
+from torchblur.shading import needing_points
 from torchblur.sort import argsort_by
-from torchblur.texture import to_texels
+from torchblur.texture_bends import TexturePaths
 
-FEW, MANY = 2, 4  # nodes of a panel: exact to degree 3 and 7 in time
-NEARLY_LINEAR = 1.02  # ratio of Q over a panel below which 2 nodes are right to about 1e-10 of the contrast
-MAX_RATIO = 1.25  # above it a panel is halved: 4 nodes then are right to about 1e-9 of the contrast
-MAX_HALVINGS = 16  # towards an end at which Q vanishes (a face seen edge-on); the place itself stays finite there
-SAME_TIME = 1e-12  # of the cell
+COUNTS = (1, 2, 3, 4, 6, 8, 12, 16)  # nodes of a panel
+TOLERANCE = 1e-6  # of what is looked at: the contrast of a texture between neighbours, the light on a facing surface
+BOUND = 40.0  # 64 / 15 / 2 times the most by which a look can exceed its size while all q stay within their shares
+ROUNDING = 1e-13  # of the mean of a q: smaller coefficients are rounding
+SCALE_LIMIT = 0.5  # share of its mean by which S may vary
+MAX_DEGREE = 15  # of a look: six layers with textured opacity in a cell; beyond, the certificate is a rule of thumb
+MAX_HALVINGS = 16  # towards a time at which a q vanishes (a face seen edge-on); what is looked at stays finite there
+MANY, FREE_HALVINGS = 8, 4  # panels of a span that may fail after so many halvings; more are noise, and accepted
 
 
 @dataclass(frozen=True)
@@ -40,169 +52,221 @@ class Samples:
     is_flat: Tensor  # (S,) bool: stands for its whole cell, in which nothing changes
 
 
-def place_samples(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[Tensor, Tensor]) -> Samples:
-    """Return the samples of all cells.
+@dataclass(frozen=True)
+class Varying:
+    """What varies within cells: the paths of their layers with texture or light, over spans."""
+
+    cell: Tensor  # (n,) int64 cell of each span
+    start: Tensor  # (n,) share of the cell
+    end: Tensor  # (n,)
+    degree: Tensor  # (n,) int64 of the looks of the span's cell
+    paths: Paths
+    textured: TexturePaths
+    which_textured: Tensor  # which of the paths
+    lit: LightPaths
+    which_lit: Tensor
+
+
+def middle_samples(cells: Cells) -> Samples:
+    """Return one sample for each cell, in its middle: exact where nothing changes within cells. Source: ours."""
+    every = torch.arange(len(cells.t_start), device=cells.t_start.device)
+    middle = 0.5 * (cells.t_start + cells.t_end)
+    return Samples(every, middle, torch.ones_like(middle), torch.ones_like(every, dtype=torch.bool))
+
+
+@torch.no_grad()
+def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[Tensor, Tensor]) -> Varying | None:
+    """Return what varies within the cells, None if nothing does.
 
     Args:
         prisms: of the scene.
         intervals: from which the cells were cut.
         cells: with their visible layers.
-        knots: shutter times at which a shutter bends (J,), and by how much a line delays each for every pixel
-            (J, pixels); cells with moving texture are cut there too.
+        knots: see `paths.cut_spans`.
 
-    Accuracy: lookups bend only between panels, so the error is that of Gauss's rule on a smooth function: about 1e-9
-        of the contrast of the texture within a texel.
     Source: ours.
     """
-    middle = 0.5 * (cells.t_start + cells.t_end)
-    every = torch.arange(len(middle), device=middle.device)
-    with torch.no_grad():
-        layer_face = prisms.face_of[intervals.prism[cells.layer_interval]]
-        layer = prisms.surfaces.is_textured[layer_face].nonzero().flatten()
-        if len(layer) == 0:
-            return Samples(every, middle, torch.ones_like(middle), torch.ones_like(every, dtype=torch.bool))
-        cell = packed.owners(cells.layer_offsets)[layer]
-        varying = torch.unique(cell)
-        textured = _Textured.of(prisms, intervals, cells, (cell, cells.layer_interval[layer]))
-        panels = _panels(textured, varying, _bends(textured, cells, knots))
-        panels, ratio = _halve(textured, panels, len(middle))
-        opacity = prisms.surfaces.has_varying_opacity[layer_face[layer]]
-        n_opacity = torch.zeros_like(every).index_add(0, cell, opacity.long())
-        parts = []
-        is_easy = (ratio <= NEARLY_LINEAR) & (n_opacity[panels[0]] == 0)
-        for chosen, n in ((is_easy, FEW), (~is_easy, MANY)):
-            owner, start, end = (p[chosen] for p in panels)
-            place, weight = (torch.as_tensor(a, device=middle.device) for a in np.polynomial.legendre.leggauss(n))
-            tau = start + (end - start) * (0.5 * (place.unsqueeze(1) + 1))
-            share = (end - start) * 0.5 * weight.unsqueeze(1)
-            parts.append((owner.repeat(n), tau.flatten(), share.flatten()))
-        is_varying = torch.zeros_like(every, dtype=torch.bool)
-        is_varying[varying] = True
-        rest = (~is_varying).nonzero().flatten()
-        one = torch.ones_like(middle[rest])
-        parts.append((rest, 0.5 * one, one))
-        owner, tau, share = (torch.cat(p) for p in zip(*parts, strict=True))
-        order = argsort_by(owner, tau)
-        owner, tau, share = owner[order], tau[order], share[order]
-    t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
+    surfaces = prisms.surfaces
+    face = prisms.face_of[intervals.prism[cells.layer_interval]]
+    if len(needing_points(surfaces, face)) == 0:
+        return None
+    spans = cut_spans(prisms, intervals, cells, knots)
+    paths = follow(prisms, intervals, cells, spans)
+    which_textured = surfaces.is_textured[paths.face].nonzero().flatten()
+    is_lit = surfaces.is_lit[paths.face] if surfaces.lights else torch.zeros_like(paths.span, dtype=torch.bool)
+    which_lit = is_lit.nonzero().flatten()
+    textured = TexturePaths.of(prisms, paths.choose(which_textured))
+    span = textured.paths.span
+    own = torch.zeros_like(spans.cell).scatter_reduce(0, span, torch.full_like(span, 2), "amax")
+    own.scatter_reduce_(0, span[textured.mipped], torch.full_like(textured.mipped, 3), "amax")
+    varies = surfaces.has_varying_opacity[textured.paths.face].long()
+    return Varying(
+        cell=spans.cell,
+        start=spans.start,
+        end=spans.end,
+        degree=(own.index_add(0, span, 2 * varies) + 1).clamp(max=MAX_DEGREE),  # 1 for the shutter
+        paths=paths,
+        textured=textured,
+        which_textured=which_textured,
+        lit=LightPaths.of(prisms, paths.choose(which_lit)),
+        which_lit=which_lit,
+    )
+
+
+@torch.no_grad()
+def count_lookups(prisms: Prisms, cells: Cells, varying: Varying | None) -> int:
+    """Return about how many looks at layers the cells will take: an estimate, for memory. Source: ours."""
+    n_layers = cells.layer_offsets.diff()
+    if varying is None:
+        return int(n_layers.sum())
+    lines = varying.textured.count_lines(prisms)
+    panels = torch.ones_like(varying.start).index_add(0, varying.textured.paths.span, lines)
+    nodes = torch.where(varying.degree > 1, 4, 8)
+    return int((panels * nodes * n_layers[varying.cell]).sum())
+
+
+@torch.no_grad()
+def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samples:
+    """Return the samples of all cells.
+
+    Args:
+        prisms: of the scene.
+        cells: with their visible layers.
+        varying: of `find_varying`.
+
+    Accuracy: TOLERANCE, certified; see the top of the file.
+    Source: Trefethen 2013; ours.
+    """
+    if varying is None:
+        return middle_samples(cells)
+    device = cells.t_start.device
+    panels = _cut_panels(prisms, varying)
+    owner, start, end, n_nodes = _count_nodes(_dividers(prisms, varying), varying, panels)
+    owners, taus, shares = [], [], []
+    for n in COUNTS:
+        chosen = (n_nodes == n).nonzero().flatten()
+        place, weight = (torch.as_tensor(a, device=device) for a in _gauss(n))
+        length = (end - start)[chosen]
+        owners.append(owner[chosen].repeat(n))
+        taus.append((start[chosen] + length * (0.5 * (place.unsqueeze(1) + 1))).flatten())
+        shares.append((length * (0.5 * weight.unsqueeze(1))).flatten())
+    span, tau, share = torch.cat(owners), torch.cat(taus), torch.cat(shares)
+    length = varying.end - varying.start
+    is_varying = torch.zeros(len(cells.t_start), dtype=torch.bool, device=device)
+    is_varying[varying.cell] = True
+    rest = (~is_varying).nonzero().flatten()
+    one = torch.ones(len(rest), dtype=torch.float64, device=device)
+    owner = torch.cat([varying.cell[span], rest])
+    tau = torch.cat([varying.start[span] + tau * length[span], 0.5 * one])
+    share = torch.cat([share * length[span], one])
+    order = argsort_by(owner, tau)
+    owner, tau, share = owner[order], tau[order], share[order]
+    with torch.enable_grad():
+        t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
     return Samples(owner, t, share, ~is_varying[owner])
 
 
-def count_nodes(prisms: Prisms, intervals: Intervals, cells: Cells) -> int:
-    """Return about how many lookups the layers of the cells will take: an estimate, for memory. Source: ours."""
-    with torch.no_grad():
-        face = prisms.face_of[intervals.prism[cells.layer_interval]]
-        layer = prisms.surfaces.is_textured[face].nonzero().flatten()
-        if len(layer) == 0:
-            return len(cells.layer_interval)
-        cell = packed.owners(cells.layer_offsets)[layer]
-        textured = _Textured.of(prisms, intervals, cells, (cell, cells.layer_interval[layer]))
-        lines = sum((high - low + 1).clamp(min=0) for low, high in (_lines(textured, axis) for axis in (0, 1)))
-        panels = torch.zeros_like(cells.t_start).index_add(0, cell, lines + 2)
-        return int((panels * cells.layer_offsets.diff()).sum()) * MANY
+@cache
+def _gauss(n: int) -> tuple[np.ndarray, np.ndarray]:
+    return np.polynomial.legendre.leggauss(n)
 
 
-@dataclass(frozen=True)
-class _Textured:
-    """The textured layers of cells, and their places on the texture over the cell as P / Q."""
-
-    cell: Tensor  # (K,) int64, sorted
-    place: Tensor  # (2, 3, K) Bernstein coefficients of P in x and y
-    scale: Tensor  # (3, K) Bernstein coefficients of Q
-    low: Tensor  # (2, K) least texel line that can matter
-    high: Tensor  # (2, K)
-
-    @classmethod
-    def of(cls, prisms: Prisms, intervals: Intervals, cells: Cells, layers: tuple[Tensor, Tensor]) -> _Textured:
-        """Return the polynomials of layers (cell, interval) over their cells."""
-        cell, interval = layers
-        prism = intervals.prism[interval]
-        pixel = packed.owners(intervals.offsets)[interval]
-        span = (prisms.t_close - prisms.t_open)[prism]
-        u_start, u_end = ((t[cell] - prisms.t_open[prism]) / span for t in (cells.t_start, cells.t_end))
-        corners = edges.reduce_corners(prisms.clip, prism, intervals.ray_ndc[:, pixel]).between(u_start, u_end)
-        e = edges.edge_coefficients(corners)
-        face = prisms.face_of[prism]
-        texel = to_texels(prisms.surfaces, face, corner_uv(prisms, prism))  # (2, 3, K)
-        mesh = prisms.surfaces.mesh_of[face]
-        last = (prisms.surfaces.atlas.size[:, mesh] - 1).to(torch.float64)
-        repeats = prisms.surfaces.atlas.repeats[mesh]
-        low, high = texel.amin(1), texel.amax(1)  # the place is a mean of the corners'
-        low = torch.where(repeats, low, torch.maximum(low, torch.zeros_like(low)))
-        high = torch.where(repeats, high, torch.minimum(high, last))
-        return cls(cell, (e.unsqueeze(0) * texel.unsqueeze(1)).sum(2), e.sum(1), low, high)
-
-
-def _bends(textured: _Textured, cells: Cells, knots: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return the cells (B,) and times tau (B,) at which a lookup crosses a texel line, or a shutter bends."""
-    owner_parts, tau_parts = [], []
-    for axis in (0, 1):
-        low, high = _lines(textured, axis)
-        line, of = packed.expand(low.long(), (high - low + 1).clamp(min=0).long())
-        c = textured.place[axis][:, of] - line * textured.scale[:, of]
-        for tau in _quadratic_roots(c):
-            inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
-            owner_parts.append(textured.cell[of[inside]])
-            tau_parts.append(tau[inside])
-    times, delays = knots
-    cell = torch.unique(textured.cell)
-    pixel = packed.owners(cells.offsets)[cell]
-    for time, delay in zip(times, delays, strict=True):
-        tau = (time + delay[pixel] - cells.t_start[cell]) / (cells.t_end - cells.t_start)[cell]
+def _cut_panels(prisms: Prisms, varying: Varying) -> tuple[Tensor, Tensor, Tensor]:
+    """Return span, start and end (p,) of the slices between the bends."""
+    every = torch.arange(len(varying.cell), device=varying.cell.device)
+    owners, taus = [every, every], [torch.zeros_like(varying.start), torch.ones_like(varying.start)]
+    for curves in (varying.textured, varying.lit):
+        which, tau = curves.bends(prisms)
         inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
-        owner_parts.append(cell[inside])
-        tau_parts.append(tau[inside])
-    return torch.cat(owner_parts), torch.cat(tau_parts)
+        owners.append(curves.paths.span[which[inside]])
+        taus.append(tau[inside])
+    return between(torch.cat(owners), torch.cat(taus))
 
 
-def _lines(textured: _Textured, axis: int) -> tuple[Tensor, Tensor]:
-    """Return the first and the last texel line (K,) that the place may cross: P / Q lies in the hull of its ratios."""
-    place, scale = textured.place[axis], textured.scale
-    ratio = place / torch.where(scale != 0, scale, 1.0)
-    is_proper = (scale > 0).all(0) | (scale < 0).all(0)
-    low = torch.where(is_proper, torch.maximum(ratio.amin(0), textured.low[axis]), textured.low[axis])
-    high = torch.where(is_proper, torch.minimum(ratio.amax(0), textured.high[axis]), textured.high[axis])
-    return low.ceil(), high.floor()
+def _dividers(prisms: Prisms, varying: Varying) -> list[tuple[Tensor, Tensor, float]]:
+    """Return the q: the spans (m,) they belong to, sorted, coefficients (d + 1, c, m), and how far they may vary."""
+    textured, lit = varying.textured, varying.lit
+    scaled = torch.zeros_like(varying.paths.span, dtype=torch.bool)
+    scaled[varying.which_textured] = True
+    if any(lit.is_near):
+        scaled[varying.which_lit] = True
+    scaled = scaled.nonzero().flatten()
+    found = [(varying.paths.span[scaled], varying.paths.scale[:, scaled].unsqueeze(1), SCALE_LIMIT)]
+    found.append((textured.paths.span[textured.mipped], textured.slope, SCALE_LIMIT / 2))
+    found += [(lit.paths.span[which], q, limit) for which, q, limit in lit.smooth_vectors(prisms)]
+    return [f for f in found if len(f[0])]
 
 
-def _quadratic_roots(c: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both roots (n,) of quadratics with Bernstein coefficients (3, n); NaN or infinite where there is none."""
-    h, c2 = c[1] - c[0], c[0] - 2 * c[1] + c[2]
-    q = -(h + torch.copysign(torch.sqrt(h * h - c2 * c[0]), h))
-    return q / c2, c[0] / q
-
-
-def _panels(textured: _Textured, varying: Tensor, bends: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Return cell, start and end (p,) of the slices between the bends of the cells `varying`."""
-    zero = torch.zeros(len(varying), dtype=torch.float64, device=varying.device)
-    owner = torch.cat([varying, varying, bends[0]])
-    tau = torch.cat([zero, zero + 1, bends[1]])
-    order = argsort_by(owner, tau)
-    owner, tau = owner[order], tau[order]
-    real = ((owner[1:] == owner[:-1]) & (tau[1:] - tau[:-1] > SAME_TIME)).nonzero().flatten()
-    start, end = tau[real], tau[real + 1]
-    return owner[real], start, end
-
-
-def _halve(
-    textured: _Textured, panels: tuple[Tensor, Tensor, Tensor], n_cells: int
-) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Return panels over which Q changes by little, and by how much, as a ratio (p,)."""
-    offsets = packed.offsets_from_owners(textured.cell, n_cells)
-    done, ratios = [], []
+def _count_nodes(
+    dividers: list[tuple[Tensor, Tensor, float]], varying: Varying, panels: tuple[Tensor, Tensor, Tensor]
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Return panels, halved where necessary, and their numbers of nodes (p,)."""
+    n_spans = len(varying.cell)
+    offsets = [packed.offsets_from_owners(owner, n_spans) for owner, _, _ in dividers]
+    table = torch.tensor(_least_rho(), dtype=torch.float64, device=varying.start.device)  # (counts, degrees)
+    counts = torch.tensor([*COUNTS, COUNTS[-1]], device=table.device)
+    done = []
     for k in range(MAX_HALVINGS + 1):
-        owner, start, end = panels
-        layer, of = packed.expand(offsets[owner], offsets.diff()[owner])
-        q = bernstein.restrict(textured.scale[:, layer], start[of], end[of])
-        is_proper = (q > 0).all(0) | (q < 0).all(0)
-        steep = torch.where(is_proper, q.abs().amax(0) / torch.where(is_proper, q.abs().amin(0), 1.0), torch.inf)
-        ratio = torch.ones_like(start).scatter_reduce(0, of, steep, "amax")
-        ready = (ratio <= MAX_RATIO) if k < MAX_HALVINGS else torch.ones_like(ratio, dtype=torch.bool)
-        done.append(tuple(p[ready] for p in panels))
-        ratios.append(ratio[ready])
-        owner, start, end = (p[~ready] for p in panels)
-        if len(owner) == 0:
+        span, start, end = panels
+        rho = table[:, varying.degree[span]]  # (counts, p)
+        passes = torch.isfinite(rho)
+        for (_, q, limit), own in zip(dividers, offsets, strict=True):
+            index, of = packed.expand(own[span], own.diff()[span])
+            sizes = _chebyshev_sizes(bernstein.restrict(q[..., index], start[of], end[of]))
+            for i in range(len(COUNTS)):
+                fails = _tail(sizes, rho[i, of]) > limit * sizes[0]
+                passes[i, of[fails]] = False
+        place = (~passes).long().cumprod(0).sum(0)  # of the first count that passes
+        is_ready = place < len(COUNTS)
+        if k >= FREE_HALVINGS:
+            failing = torch.bincount(span[~is_ready], minlength=n_spans)
+            is_ready |= failing[span] > MANY
+        if k == MAX_HALVINGS:
+            is_ready = torch.ones_like(is_ready)
+        done.append((span[is_ready], start[is_ready], end[is_ready], counts[place[is_ready]]))
+        span, start, end = (p[~is_ready] for p in panels)
+        if len(span) == 0:
             break
         middle = 0.5 * (start + end)
-        panels = torch.cat([owner, owner]), torch.cat([start, middle]), torch.cat([middle, end])
-    return tuple(torch.cat(p) for p in zip(*done, strict=True)), torch.cat(ratios)
+        panels = torch.cat([span, span]), torch.cat([start, middle]), torch.cat([middle, end])
+    return tuple(torch.cat(parts) for parts in zip(*done, strict=True))
+
+
+def _chebyshev_sizes(q: Tensor) -> Tensor:
+    """Return (d + 1, m) the lengths of the Chebyshev coefficients of vectors (d + 1, c, m) in Bernstein form."""
+    to_chebyshev = torch.as_tensor(_chebyshev_matrix(len(q) - 1), device=q.device)
+    return torch.einsum("kj,jcm->kcm", to_chebyshev, q).norm(dim=1)
+
+
+@cache
+def _chebyshev_matrix(degree: int) -> np.ndarray:
+    """Return the (d + 1, d + 1) matrix from Bernstein to Chebyshev coefficients on the same range."""
+    nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
+    u = 0.5 * (nodes + 1)
+    binomial = np.cumprod([1.0, *((degree - k) / (k + 1) for k in range(degree))])
+    values = np.stack([binomial[k] * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)], axis=1)
+    chebyshev = np.stack([np.cos(k * np.arccos(nodes)) for k in range(degree + 1)], axis=1)
+    return np.linalg.solve(chebyshev, values)
+
+
+def _tail(sizes: Tensor, rho: Tensor) -> Tensor:
+    """Return (m,) the most by which a q can leave its mean on the ellipse of `rho` (m,)."""
+    total = torch.zeros_like(rho)
+    for k in range(1, len(sizes)):
+        grown = 0.5 * sizes[k] * (rho**k + rho**-k)
+        total = total + torch.where(sizes[k] > ROUNDING * sizes[0], grown, 0.0)
+    return total
+
+
+@cache
+def _least_rho() -> list[list[float]]:
+    """Return the least rho for each of COUNTS and degrees 0 to MAX_DEGREE; infinite where no rho suffices."""
+    rows = []
+    for n in COUNTS:
+        row = []
+        for degree in range(MAX_DEGREE + 1):
+            grid = np.geomspace(1.01, 1e9, 4001)
+            fits = BOUND * (1 + grid / 2) ** degree * grid ** (-2.0 * n) / (1 - grid**-2) <= TOLERANCE
+            row.append(float(grid[fits.argmax()]) if fits.any() else np.inf)
+        rows.append(row)
+    return rows

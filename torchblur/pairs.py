@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchblur import packed
+from torchblur.camera import Ray
 from torchblur.prisms import BOUND_SLACK_PX, Prisms
 
 ROUNDING = 1e-12  # of the largest coordinate: slack of a span for prisms that reach far off the screen
@@ -28,7 +29,7 @@ class Block:
     y0: int  # first row [px]
     width: int
     height: int
-    ray_px: tuple[float, float]  # place of the ray inside its pixel, (0.5, 0.5) is the centre
+    ray: Ray  # place of the ray inside its pixel
     image_width: int
     image_height: int
 
@@ -39,18 +40,23 @@ class Block:
 
     def ray_ndc(self, pixel: Tensor) -> Tensor:
         """Return (2, n) float64 NDC of the rays of the block's pixels `pixel` (n,), row by row."""
-        x_px = (self.x0 + pixel % self.width).to(torch.float64) + self.ray_px[0]
-        y_px = (self.y0 + pixel // self.width).to(torch.float64) + self.ray_px[1]
+        x_px = (self.x0 + pixel % self.width).to(torch.float64) + self.ray.x_px
+        y_px = (self.y0 + pixel // self.width).to(torch.float64) + self.ray.y_px
         return torch.stack([2 * x_px / self.image_width - 1, 1 - 2 * y_px / self.image_height])
+
+    @property
+    def spacing_ndc(self) -> tuple[float, float]:
+        """Distance in NDC from one ray to the next, along x and y (downwards, hence negative)."""
+        return 2 * self.ray.spacing_px / self.image_width, -2 * self.ray.spacing_px / self.image_height
 
     def columns_rows(self, bounds_px: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return the first column, first row, and numbers of columns and rows (P,) of the block whose rays `bounds_px`
         (4, P) hold.
         """
-        low_x = torch.ceil(bounds_px[0].clamp(min=-1) - self.ray_px[0]).clamp(min=self.x0)
-        low_y = torch.ceil(bounds_px[1].clamp(min=-1) - self.ray_px[1]).clamp(min=self.y0)
-        high_x = torch.floor(bounds_px[2].clamp(max=self.image_width) - self.ray_px[0])
-        high_y = torch.floor(bounds_px[3].clamp(max=self.image_height) - self.ray_px[1])
+        low_x = torch.ceil(bounds_px[0].clamp(min=-1) - self.ray.x_px).clamp(min=self.x0)
+        low_y = torch.ceil(bounds_px[1].clamp(min=-1) - self.ray.y_px).clamp(min=self.y0)
+        high_x = torch.floor(bounds_px[2].clamp(max=self.image_width) - self.ray.x_px)
+        high_y = torch.floor(bounds_px[3].clamp(max=self.image_height) - self.ray.y_px)
         n_x = (high_x.clamp(max=self.x0 + self.width - 1) - low_x + 1).clamp(min=0)
         n_y = (high_y.clamp(max=self.y0 + self.height - 1) - low_y + 1).clamp(min=0)
         return low_x.long(), low_y.long(), n_x.long(), n_y.long()
@@ -89,7 +95,7 @@ def _hull_columns(corners_px: Tensor, row: Tensor, block: Block) -> tuple[Tensor
     Where the ray's row misses the hull by rounding, or there is no hull, all columns.
     """
     x, y = corners_px
-    level = row.to(torch.float64) + block.ray_px[1]
+    level = row.to(torch.float64) + block.ray.y_px
     low = torch.full_like(level, torch.inf)
     high = torch.full_like(level, -torch.inf)
     for i, j in itertools.combinations(range(6), 2):
@@ -99,8 +105,8 @@ def _hull_columns(corners_px: Tensor, row: Tensor, block: Block) -> tuple[Tensor
         low = torch.where(crosses, torch.minimum(low, place), low)
         high = torch.where(crosses, torch.maximum(high, place), high)
     slack = BOUND_SLACK_PX + ROUNDING * torch.maximum(x.abs().amax(0), y.abs().amax(0))
-    first = torch.ceil(low - slack - block.ray_px[0])
-    last = torch.floor(high + slack - block.ray_px[0])
+    first = torch.ceil(low - slack - block.ray.x_px)
+    last = torch.floor(high + slack - block.ray.x_px)
     none = ~(low <= high) | ~(slack < 1)  # NaN corners too
     first = torch.where(none, float(block.x0), first.clamp(block.x0, block.x0 + block.width))
     last = torch.where(none, float(block.x0 + block.width - 1), last.clamp(block.x0 - 1, block.x0 + block.width - 1))

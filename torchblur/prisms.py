@@ -36,6 +36,8 @@ class Prisms:
     parity: Tensor  # (P,) float64, +1 where the stored corners turn as the face's do, else -1
     is_clipped: Tensor  # (P,) bool: reaches beyond the near or the far plane
     bounds_px: Tensor  # (4, P) float64 x0 y0 x1 y1 of the swept area on screen [px], conservative
+    world: Tensor  # (2, 3, 3, P) float64: end, corner, x y z; (2, 3, 3, 0) where the scene has nothing to light
+    normal: Tensor  # (2, 3, 3, P) float64 normals at the corners, of any length, 0 where there are none; or as `world`
     corners_px: Tensor  # (2, 6, P) float64 x, y of the corners on screen [px]; NaN where one is behind the near plane
     surfaces: Surfaces  # what the faces look like
     orders_by_w: bool  # depth order by 1 / w, else by z / w
@@ -73,12 +75,15 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
         corners = mesh.faces[face - surfaces.first_face[i]]
         at = torch.tensor(times, dtype=torch.float64, device=scene.device)
         clip_vertices = scene.clip_at(mesh, at)
+        attributes = [mesh.vertices_at(at), mesh.normals_at(at)] if surfaces.is_lit.any() else []
         is_static = mesh.n_segments == camera.n_segments == 0
         for k in range(len(times) - 1):
             clip_open = clip_vertices[k, corners].permute(1, 2, 0)  # (3, 4, F)
             clip_close = clip_open if is_static else clip_vertices[k + 1, corners].permute(1, 2, 0)
-            parts.append(_seen(scene, torch.stack([clip_open, clip_close]), (times[k], times[k + 1]), face))
-    clip, t_open, t_close, face_of, corner_of, parity, is_clipped, bounds, corners_px = (
+            moving = [a[k : k + 2, corners].permute(0, 2, 3, 1) for a in attributes]  # (2, 3, 3, F)
+            ends = torch.stack([clip_open, clip_close])
+            parts.append(_seen(scene, (ends, *moving), (times[k], times[k + 1]), face))
+    clip, t_open, t_close, face_of, corner_of, parity, is_clipped, bounds, world, normal, corners_px = (
         torch.cat(p, dim=-1) for p in zip(*parts, strict=True)
     )
     return Prisms(
@@ -90,6 +95,8 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
         parity=parity,
         is_clipped=is_clipped,
         bounds_px=bounds,
+        world=world,
+        normal=normal,
         corners_px=corners_px,
         surfaces=surfaces,
         orders_by_w=camera.orders_by_w,
@@ -112,13 +119,16 @@ def _no_prisms(device: torch.device) -> tuple[Tensor, ...]:
     empty = torch.zeros(0, dtype=torch.float64, device=device)
     clip, no_face = empty.reshape(2, 3, 4, 0), empty.long()
     faces = no_face, no_face.reshape(3, 0), empty, empty.bool()
-    return clip, empty, empty, *faces, empty.reshape(4, 0), empty.reshape(2, 6, 0)
+    moving = empty.reshape(2, 3, 3, 0)
+    return clip, empty, empty, *faces, empty.reshape(4, 0), moving, moving, empty.reshape(2, 6, 0)
 
 
-def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tensor) -> tuple[Tensor, ...]:
-    """Return the fields of the prisms (2, 3, 4, F) of one slice of time that are not wholly outside the view, with
-    their corners in canonical order.
+def _seen(scene: Scene, corners: tuple[Tensor, ...], times: tuple[float, float], face_of: Tensor) -> tuple[Tensor, ...]:
+    """Return the fields of the prisms of one slice of time that are not wholly outside the view, with their corners in
+    canonical order; `corners` are clip space (2, 3, 4, F) and, where there is something to light, world positions and
+    normals (2, 3, 3, F).
     """
+    clip, *moving = corners
     width, height = scene.camera.width, scene.camera.height
     with torch.no_grad():
         corner_of, parity = canonical_corners(clip)
@@ -132,10 +142,14 @@ def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tenso
         has_hull = ((near >= 0) & (clip[:, :, 3] > 0)).all(0).all(0)
         corners_px = clip_to_px(clip.movedim(2, -1), width, height).movedim(-1, 0).flatten(1, 2)
         corners_px = torch.where(has_hull, corners_px, torch.nan)
-    order = corner_of[:, kept].reshape(1, 3, 1, -1).expand(2, 3, 4, -1)
+    order = corner_of[:, kept].reshape(1, 3, 1, -1)
+
+    def stored(corners: Tensor) -> Tensor:
+        return corners[..., kept].gather(1, order.expand(2, 3, corners.shape[2], -1))
+
     one = torch.ones(len(kept), dtype=torch.float64, device=clip.device)
     return (
-        clip[..., kept].gather(1, order),
+        stored(clip),
         times[0] * one,
         times[1] * one,
         face_of[kept],
@@ -143,6 +157,7 @@ def _seen(scene: Scene, clip: Tensor, times: tuple[float, float], face_of: Tenso
         parity[kept],
         is_clipped[kept],
         bounds[:, kept],
+        *(map(stored, moving) if moving else (clip.new_zeros(2, 3, 3, 0),) * 2),
         corners_px[..., kept],
     )
 

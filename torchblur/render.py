@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchblur import check, packed
 from torchblur.accuracy import Accuracy
-from torchblur.camera import MAX_RAYS, pixel_rays
+from torchblur.camera import MAX_RAYS, Ray, pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
-from torchblur.nodes import count_nodes, place_samples
+from torchblur.nodes import count_lookups, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
@@ -195,10 +195,10 @@ class _Job:
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
         return Frame(rgba, coverage.to(scene.dtype), self.ledger.counts, self.ledger.timings)
 
-    def _image(self, prisms: Prisms, ray_px: tuple[float, float]) -> Tensor:
+    def _image(self, prisms: Prisms, ray: Ray) -> Tensor:
         """Return (shutters, H, W, 4 + M) float64: premultiplied colour, alpha and coverage for one ray per pixel."""
         camera, device = self.scene.camera, self.scene.device
-        whole = Block(0, 0, camera.width, camera.height, ray_px, camera.width, camera.height)
+        whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
         every = torch.arange(prisms.count, device=device)
         places, values = [], []
         for block, candidates in self._blocks(prisms, whole, every):
@@ -223,22 +223,23 @@ class _Job:
     def _resolve(self, prisms: Prisms, intervals: Intervals, pixel: tuple[Tensor, Tensor]) -> Tensor:
         """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`."""
         camera, device = self.scene.camera, self.scene.device
+        column, row = pixel
+        lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("cells", device):
             cells = cut_cells(prisms, intervals)
-            nodes = count_nodes(prisms, intervals, cells)
-        if nodes * BYTES_PER_NODE > self.memory_bytes and len(pixel[0]) > 1:
-            half = len(pixel[0]) // 2
+            varying = find_varying(prisms, intervals, cells, self._knots(lines))
+            lookups = count_lookups(prisms, cells, varying)
+        if lookups * BYTES_PER_NODE > self.memory_bytes and len(column) > 1:
+            half = len(column) // 2
             parts = []
-            for chosen in torch.arange(len(pixel[0]), device=device).split([half, len(pixel[0]) - half]):
-                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), tuple(p[chosen] for p in pixel)))
+            for chosen in torch.arange(len(column), device=device).split([half, len(column) - half]):
+                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), (column[chosen], row[chosen])))
             return torch.cat(parts)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
         self.ledger.add("crossings", cells.n_crossings)
-        column, row = pixel
-        lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("resolve", device):
-            samples = place_samples(prisms, intervals, cells, self._knots(lines))
+            samples = place_samples(prisms, cells, varying)
             self.ledger.add("nodes", len(samples.cell))
             pixel_of = packed.owners(cells.offsets)[samples.cell]
             offsets = packed.offsets_from_owners(pixel_of, len(column))

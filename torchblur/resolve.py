@@ -18,7 +18,7 @@ from torchblur.cells import Cells
 from torchblur.intervals import Intervals
 from torchblur.nodes import Samples
 from torchblur.prisms import Prisms
-from torchblur.shading import look, texels_on_prisms, textured_among
+from torchblur.shading import look, needing_points, points_on_prisms
 from torchblur.shutter import Shutter
 
 
@@ -51,19 +51,17 @@ def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, sample
         cutoff: transmittance at which a ray ends; see `packed.transmittance`.
 
     Accuracy: opacities are multiplied at each time, never their means; with a cut-off, see `Accuracy`.
-    Gradient: to colour, opacity, texture, and through the samples' times.
+    Gradient: to colour, opacity, texture, normals, lights, and through the samples' times.
     Source: Ronnow et al. 2021, alg. 1.
     """
     counts = cells.layer_offsets.diff()[samples.cell]
     layer, sample = packed.expand(cells.layer_offsets[samples.cell], counts)
     offsets = packed.offsets_from_counts(counts)
     surfaces, interval = prisms.surfaces, cells.layer_interval[layer]
-    prism = intervals.prism[interval]
-    face = prisms.face_of[prism]
-    textured = textured_among(surfaces, face)
-    ray = intervals.ray_ndc[:, packed.owners(intervals.offsets)[interval[textured]]]
-    texel = texels_on_prisms(prisms, prism[textured], ray, samples.t[sample[textured]])
-    rgb, alpha = look(surfaces, face, textured, texel)
+    face = prisms.face_of[intervals.prism[interval]]
+    which = needing_points(surfaces, face)
+    points = points_on_prisms(prisms, intervals, interval[which], samples.t[sample[which]])
+    rgb, alpha = look(surfaces, face, which, points)
     before, after = packed.transmittance(alpha, offsets, cutoff)
     light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
     n_meshes = max(1, len(surfaces.first_face))

@@ -1,6 +1,6 @@
-"""Scene: moving triangle meshes, what they are made of, the camera and the background.
+"""Scene: moving triangle meshes, the camera, the lights and the background.
 
-Before: camera.py.  After: prisms.py (the exposure), instant.py (one instant).
+Before: camera.py, lights.py, material.py.  After: prisms.py (the exposure), instant.py (one instant).
 Symbols: V vertices, F faces, K segments of a motion (K+1 knots at equally spaced shutter times).
 """
 
@@ -14,45 +14,8 @@ from torch import Tensor
 
 from torchblur import check
 from torchblur.camera import Camera, lerp_knots, project_world
-
-WRAPS = ("repeat", "clamp")
-
-
-@dataclass(frozen=True, eq=False)
-class Material:
-    """What a mesh is made of: straight (not premultiplied) linear colour and opacity, constant or per face.
-
-    Args:
-        color: (3,) or (F, 3) linear RGB, at least 0; above 1 is light that outshines white.
-        opacity: a number or (F,), in [0, 1].
-        texture: (h, w, 3) linear RGB that multiplies the colour, or (h, w, 4) with an opacity that multiplies the
-            opacity; row 0 is the top, v = 0 the bottom edge; texel centres at (k + 0.5) / size; bilinear.
-        wrap: "repeat" or "clamp": what uv outside [0, 1] mean.
-        double_sided: show back faces too; otherwise only faces whose vertices turn counter-clockwise on screen,
-            decided exactly in time.
-
-    Raises:
-        TypeError, ValueError: wrong shape or type, NaN, inf, or out of range.
-    """
-
-    color: Any = (0.8, 0.8, 0.8)
-    opacity: Any = 1.0
-    double_sided: bool = field(default=True, kw_only=True)
-    texture: Any = field(default=None, kw_only=True)
-    wrap: str = field(default="repeat", kw_only=True)
-
-    def __post_init__(self) -> None:
-        color = check.floats("color", self.color, (3,), ("F", 3))
-        if (color.detach() < 0).any():
-            raise check.fail("color", "values of at least 0", f"{float(color.detach().min())}")
-        opacity = check.unit_range("opacity", check.floats("opacity", self.opacity, (), ("F",)))
-        if not isinstance(self.double_sided, bool):
-            raise check.fail_type("double_sided", "True or False", self.double_sided)
-        if self.wrap not in WRAPS:
-            raise check.fail("wrap", " or ".join(WRAPS), self.wrap)
-        object.__setattr__(self, "color", color)
-        object.__setattr__(self, "opacity", opacity)
-        object.__setattr__(self, "texture", None if self.texture is None else _checked_texture(self.texture))
+from torchblur.lights import LIGHTS, Light
+from torchblur.material import Material
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +27,8 @@ class Mesh:
         faces: (F, 3) integers in [0, V).
         material: colour, opacity, texture, sides; per-face values must be F long.
         uv: (F, 3, 2) float texture coordinates of the faces' corners; a texture needs them.
+        normals: (V, 3) static, or (K+1, V, 3) with the vertices' knots: directions of any length above 0 at the
+            vertices, for smooth lighting; they turn linearly between knots. Without them faces are flat.
         name: for messages and metadata.
 
     Raises:
@@ -80,6 +45,7 @@ class Mesh:
     material: Material = field(default_factory=Material)
     name: str = field(default="mesh", kw_only=True)
     uv: Any = field(default=None, kw_only=True)
+    normals: Any = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
@@ -103,6 +69,11 @@ class Mesh:
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         object.__setattr__(self, "uv", uv)
+        if self.normals is not None:
+            normals = check.floats("normals", self.normals, vertices.shape[-2:], vertices.shape)
+            if (normals.detach() == 0).all(-1).any():
+                raise check.fail("normals", "vectors that are not 0", "a vector of zeros")
+            object.__setattr__(self, "normals", normals)
 
     @property
     def n_segments(self) -> int:
@@ -121,6 +92,13 @@ class Mesh:
             return vertices.expand(len(t), *vertices.shape)
         return lerp_knots(vertices, t)
 
+    def normals_at(self, t: Tensor) -> Tensor:
+        """Return (N, V, 3) float64 normals, of any length, at the shutter times `t` (N,); 0 if the mesh has none."""
+        if self.normals is None:
+            return self.vertices.new_zeros((len(t), self.vertices.shape[-2], 3), dtype=torch.float64)
+        normals = self.normals.to(self.vertices.device, torch.float64)
+        return normals.expand(len(t), *normals.shape) if normals.ndim == 2 else lerp_knots(normals, t)
+
     def face_rgb(self) -> Tensor:
         """Return (F, 3) float64 straight linear colour of the faces."""
         return self.material.color.to(self.vertices.device, torch.float64).expand(self.n_faces, 3)
@@ -132,12 +110,18 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Meshes, a camera and what is behind them.
+    """Meshes, a camera, what lights them and what is behind them.
+
+    A face of shading "lambert" shows its colour times (ambient + sum of irradiance / pi * cosine) over the lights: with
+    its own normal turned to the viewer, or with the mesh's vertex normals (negated where the back of the face is seen).
+    Lights cast no shadows.
 
     Args:
         meshes: any number of meshes, none too.
         camera: sees them; its device must be that of the meshes.
         background: (3,) linear RGB, or an image (H, W, 3) the size of the camera's.
+        lights: any number of `PointLight`, `SpotLight`, `DirectionalLight`.
+        ambient: (3,) linear RGB of the light that comes equally from everywhere, as radiance.
 
     Raises:
         TypeError, ValueError: a wrong argument, named; tensors on several devices.
@@ -146,6 +130,8 @@ class Scene:
     meshes: list[Mesh] | tuple[Mesh, ...]
     camera: Camera
     background: Any = (0.0, 0.0, 0.0)
+    lights: list[Light] | tuple[Light, ...] = field(default=(), kw_only=True)
+    ambient: Any = field(default=(0.0, 0.0, 0.0), kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.meshes, (list, tuple)) or not all(isinstance(m, Mesh) for m in self.meshes):
@@ -157,16 +143,28 @@ class Scene:
         background = check.floats("background", self.background, (3,), (h, w, 3))
         if (background.detach() < 0).any():
             raise check.fail("background", "values of at least 0", f"{float(background.detach().min())}")
+        if not isinstance(self.lights, (list, tuple)) or not all(isinstance(light, LIGHTS) for light in self.lights):
+            names = ", ".join(kind.__name__ for kind in LIGHTS)
+            raise check.fail_type("lights", f"a sequence of {names}", self.lights)
+        object.__setattr__(self, "lights", tuple(self.lights))
+        ambient = check.floats("ambient", self.ambient, (3,))
+        if (ambient.detach() < 0).any():
+            raise check.fail("ambient", "values of at least 0", f"{float(ambient.detach().min())}")
+        object.__setattr__(self, "ambient", ambient)
         device = self.camera.world_to_clip.device
         named = {f"meshes[{i}].vertices": m.vertices for i, m in enumerate(self.meshes)}
         named |= {f"meshes[{i}].faces": m.faces for i, m in enumerate(self.meshes)}
         check.same_device(**{"camera.world_to_clip": self.camera.world_to_clip, **named})
         for i, mesh in enumerate(self.meshes):
             parts = {f"material.{part}": getattr(mesh.material, part) for part in ("color", "opacity", "texture")}
-            for part, value in (parts | {"uv": mesh.uv}).items():
+            for part, value in (parts | {"uv": mesh.uv, "normals": mesh.normals}).items():
                 if value is not None:
                     _same_device_if_large(f"meshes[{i}].{part}", value, device)
+        for i, light in enumerate(self.lights):
+            for part, value in light.tensors().items():
+                _same_device_if_large(f"lights[{i}].{part}", value, device)
         _same_device_if_large("background", background, device)
+        _same_device_if_large("ambient", ambient, device)
         object.__setattr__(self, "background", background)
 
     @property
@@ -210,28 +208,19 @@ class Scene:
         return torch.cat([rgb, alpha], dim=-1)
 
     def tensors(self) -> list[Tensor]:
-        """Return all floating tensors of the scene."""
-        parts = [self.camera.world_to_clip, self.background]
+        """Return all floating tensors of the scene. Source: ours."""
+        parts = [self.camera.world_to_clip, self.background, self.ambient]
+        for light in self.lights:
+            parts += light.tensors().values()
         for mesh in self.meshes:
-            parts += [mesh.vertices, mesh.material.color, mesh.material.opacity, mesh.material.texture, mesh.uv]
+            parts += [mesh.vertices, mesh.normals, mesh.uv]
+            parts += [mesh.material.color, mesh.material.opacity, mesh.material.texture]
         return [part for part in parts if part is not None]
 
     @property
     def requires_grad(self) -> bool:
         """Whether anything in the scene asks for gradients."""
         return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors())
-
-
-def _checked_texture(texture: Any) -> Tensor:
-    """Return the texture as (h, w, 3 or 4) finite floats, colours at least 0 and opacities in [0, 1]."""
-    image = check.floats("texture", texture, ("h", "w", 3), ("h", "w", 4))
-    if 0 in image.shape:
-        raise check.fail("texture", "at least one texel", image)
-    if (image.detach() < 0).any():
-        raise check.fail("texture", "values of at least 0", f"{float(image.detach().min())}")
-    if image.shape[2] == 4:
-        check.unit_range("texture's opacity", image[..., 3])
-    return image
 
 
 def _same_device_if_large(name: str, value: Tensor, device: torch.device) -> None:

@@ -1,64 +1,141 @@
-"""What a surface looks like at a time along a ray: colour and opacity, textures included.
+"""What a surface looks like at a time along a ray: colour and opacity, with texture and light.
 
-Before: texture.py, intervals.py.  After: resolve.py, instant.py.
-Symbols: K points on surfaces.
-Source: Ronnow et al. 2022, eq. 1 (perspective-correct attributes without division by w).
+Before: texture.py, lighting.py, intervals.py.  After: resolve.py, instant.py.
+Symbols: K points on surfaces, J of them with texture or light; weight_i = e_i / S the barycentric of a face's corner i.
+Source: Ronnow et al. 2022, eq. 1 and 2 (perspective-correct attributes without division by w).
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchblur import edges
+from torchblur.intervals import Intervals
+from torchblur.lighting import flat_normal, reflected
 from torchblur.prisms import Prisms
 from torchblur.surfaces import Surfaces
-from torchblur.texture import lookup, to_texels
+from torchblur.texture import lookup, mip_level
 
 
-def textured_among(surfaces: Surfaces, face: Tensor) -> Tensor:
-    """Return the indices of the faces `face` (K,) that have a texture. Ours."""
-    return surfaces.is_textured[face].nonzero().flatten()
+@dataclass(frozen=True)
+class Points:
+    """Points on faces that have texture or light; corners in any order, the same in all fields."""
+
+    face: Tensor  # (J,) int64
+    weight: Tensor  # (3, J) float64 barycentrics of the corners
+    slope: Tensor  # (2, 3, J) their change from one ray to the next along x and y; no gradient; (2, 3, 0) without mips
+    uv: Tensor  # (2, 3, J) of the corners
+    world: Tensor  # (3 corners, 3, J) positions; (3, 3, 0) where nothing is lit
+    normal: Tensor  # (3 corners, 3, J) normals, of any length; or as `world`
+    turn: Tensor  # (J,) +1 where the corners are in the face's order, else -1
+    side: Tensor  # (J,) +1 where the face turns counter-clockwise on screen, else -1
+    t: Tensor  # (J,) shutter time
 
 
-def look(surfaces: Surfaces, face: Tensor, textured: Tensor, texel: Tensor) -> tuple[Tensor, Tensor]:
+def needing_points(surfaces: Surfaces, face: Tensor) -> Tensor:
+    """Return the indices (J,) of the faces `face` (K,) whose look depends on where and when they are seen. Ours."""
+    return (surfaces.is_textured | surfaces.is_lit)[face].nonzero().flatten()
+
+
+def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tuple[Tensor, Tensor]:
     """Return straight colour (K, 3) and opacity (K,) of points on `face` (K,).
 
     Args:
         surfaces: appearance of the faces.
         face: (K,) int64.
-        textured: (J,) of `textured_among`.
-        texel: (2, J) places of these on their textures.
+        which: (J,) of `needing_points`.
+        points: these.
 
-    Gradient: to colour, opacity, texture, and through `texel`.
+    Gradient: to colour, opacity, texture, lights, and through the points.
     Source: ours.
     """
     rgb, alpha = surfaces.rgb[face], surfaces.opacity[face]
-    if len(textured) == 0:
+    if len(which) == 0:
         return rgb, alpha
-    rgba = torch.cat([rgb, alpha.unsqueeze(1)], dim=1)
-    rgba = rgba.index_put((textured,), rgba[textured] * lookup(surfaces, face[textured], texel))
-    return rgba[:, :3], rgba[:, 3]
+    textured = surfaces.is_textured[points.face].nonzero().flatten()
+    if len(textured):
+        of, own = which[textured], points.face[textured]
+        corner_uv = points.uv[..., textured]
+        level = torch.zeros(len(of), dtype=torch.float64, device=of.device)
+        if points.slope.shape[-1]:
+            level = mip_level(surfaces, own, (points.slope[..., textured].unsqueeze(0) * corner_uv.unsqueeze(1)).sum(2))
+        rgba = lookup(surfaces, own, (points.weight[:, textured] * corner_uv).sum(1), level)
+        rgb = rgb.index_put((of,), rgb[of] * rgba[:, :3])
+        alpha = alpha.index_put((of,), alpha[of] * rgba[:, 3])
+    lit = surfaces.is_lit[points.face].nonzero().flatten()
+    if len(lit):
+        light = reflected(surfaces, *_position_and_normal(surfaces, points, lit), points.t[lit])
+        rgb = rgb.index_put((which[lit],), rgb[which[lit]] * light)
+    return rgb, alpha
 
 
-def texels_on_prisms(prisms: Prisms, prism: Tensor, ray_ndc: Tensor, t: Tensor) -> Tensor:
-    """Return (2, K) places on the textures, where rays meet moving prisms at shutter times `t`.
+def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: Tensor) -> Points:
+    """Return where the rays of `interval` (J,) meet its moving faces at shutter times `t` (J,).
+
+    Gradient: to vertices, normals, camera and uv, and through `t`.
+    Source: Ronnow et al. 2022, eq. 1 and 2.
+    """
+    prism = intervals.prism[interval]
+    ray = intervals.ray_ndc[:, intervals.pixel_of(interval)]
+    u = (t - prisms.t_open[prism]) / (prisms.t_close - prisms.t_open)[prism]
+    x, y, w = edges.reduce_corners(prisms.clip, prism, ray).at(u)
+    e = edges.edges_of(x, y)
+    scale = e.sum(0)
+    slope = e.new_zeros(2, 3, 0)
+    if prisms.surfaces.has_mipmaps:
+        slope = _slopes((x, y, w), intervals.spacing_ndc).detach()
+    is_lit = prisms.world.shape[-1] > 0
+    moving = (c.index_select(-1, prism) if is_lit else c for c in (prisms.world, prisms.normal))
+    world, normal = ((1 - u) * c[0] + u * c[1] if is_lit else c[0] for c in moving)
+    parity = prisms.parity[prism]
+    return Points(
+        face=prisms.face_of[prism],
+        weight=e / scale,
+        slope=slope,
+        uv=corner_uv(prisms, prism),
+        world=world,
+        normal=normal,
+        turn=parity,
+        side=parity * scale.detach().sign(),
+        t=t,
+    )
+
+
+def weight_slopes(e: Tensor, slopes: tuple[Tensor, Tensor], spacing: tuple[float, float]) -> Tensor:
+    """Return (2, 3, J) the change of the barycentrics e / S from one ray to the next.
 
     Args:
-        prisms: of the scene.
-        prism, ray_ndc, t: (K,), (2, K), (K,).
+        e: (3, J) edge functions.
+        slopes: of e along the ray's x and y in NDC, (3, J) each.
+        spacing: from one ray to the next along x and y, in NDC.
 
-    Gradient: to vertices, camera and uv, and through `t`.
-    Source: Ronnow et al. 2022, eq. 1.
+    Source: quotient rule.
     """
-    u = (t - prisms.t_open[prism]) / (prisms.t_close - prisms.t_open)[prism]
-    x, y, _ = edges.reduce_corners(prisms.clip, prism, ray_ndc).at(u)
-    e = edges.edges_of(x, y)
-    uv = corner_uv(prisms, prism)
-    return to_texels(prisms.surfaces, prisms.face_of[prism], (e * uv).sum(1) / e.sum(0))
+    scale = e.sum(0)
+    return torch.stack(
+        [(scale * d - e * d.sum(0)) * (step / scale.square()) for d, step in zip(slopes, spacing, strict=True)]
+    )
 
 
 def corner_uv(prisms: Prisms, prism: Tensor) -> Tensor:
     """Return (2, 3, K) texture coordinates of the corners of prisms `prism` (K,) in their stored order. Ours."""
     face, order = prisms.face_of[prism], prisms.corner_of[:, prism]
     return torch.stack([prisms.surfaces.uv[face, corner] for corner in order]).permute(2, 0, 1)
+
+
+def _slopes(corners: tuple[Tensor, Tensor, Tensor], spacing: tuple[float, float]) -> Tensor:
+    """Return `weight_slopes` at reduced corners x, y, w (3, J)."""
+    x, y, w = corners
+    return weight_slopes(edges.edges_of(x, y), (edges.edges_of(y, w), edges.edges_of(w, x)), spacing)
+
+
+def _position_and_normal(surfaces: Surfaces, points: Points, lit: Tensor) -> tuple[Tensor, Tensor]:
+    """Return world positions and normals on the viewer's side, of any length, (3, I) each, of the points `lit` (I,)."""
+    weight, world = points.weight[:, lit].unsqueeze(1), points.world[..., lit]
+    normal = flat_normal(world, points.turn[lit])
+    smooth = (weight * points.normal[..., lit]).sum(0)
+    normal = torch.where(surfaces.has_normals[points.face[lit]], smooth, normal)
+    return (weight * world).sum(0), normal * (points.side[lit] * surfaces.handedness)

@@ -1,6 +1,6 @@
 """What the faces of a scene look like, all meshes end to end, and which of two coplanar ones is in front.
 
-Before: scene.py.  After: prisms.py, fragments.py, texture.py.
+Before: scene.py, atlas.py.  After: prisms.py, fragments.py, texture.py.
 Symbols: F faces of all meshes.
 """
 
@@ -12,17 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchblur.atlas import Atlas, build_atlas
+from torchblur.lights import Light
 from torchblur.scene import Mesh, Scene
-
-
-@dataclass(frozen=True)
-class Atlas:
-    """The textures of all meshes end to end; a mesh without one has a single white texel."""
-
-    texels: Tensor  # (X, 4) float64 linear RGB and opacity, row by row from the top
-    first: Tensor  # (M,) int64 first texel of each mesh's texture
-    size: Tensor  # (2, M) int64 width, height
-    repeats: Tensor  # (M,) bool
 
 
 @dataclass(frozen=True)
@@ -39,7 +31,17 @@ class Surfaces:
     has_varying_opacity: Tensor  # (F,) bool: its texture has opacities below 1, or asks for gradients
     uv: Tensor  # (F, 3, 2) float64 texture coordinates of the corners; 0 without texture
     atlas: Atlas
+    is_lit: Tensor  # (F,) bool: shows its colour times the light that it gets
+    has_normals: Tensor  # (F,) bool: its corners have normals; otherwise it is flat
+    lights: tuple[Light, ...]
+    ambient: Tensor  # (3,) float64 radiance from everywhere
+    handedness: float  # of the camera
     first_face: tuple[int, ...]  # index of the first face of each mesh
+
+    @property
+    def has_mipmaps(self) -> bool:
+        """Whether any texture has smaller copies."""
+        return len(self.atlas.first) > 1
 
 
 def build_surfaces(scene: Scene) -> Surfaces:
@@ -66,15 +68,18 @@ def build_surfaces(scene: Scene) -> Surfaces:
         rgb=cat([m.face_rgb() for m in meshes], (0, 3), f64),
         opacity=opacity,
         mesh_of=cat([torch.full((m.n_faces,), i, dtype=i64, device=device) for i, m in numbered], (0,), i64),
-        is_one_sided=cat(
-            [torch.full((m.n_faces,), not m.material.double_sided, device=device) for m in meshes], (0,), torch.bool
-        ),
+        is_one_sided=per_face([not m.material.double_sided for m in meshes]),
         tie_rank=_tie_ranks(meshes, device),
         is_opaque=is_opaque & (not opacity.requires_grad),
         is_textured=per_face([t is not None for t in textures]),
         has_varying_opacity=per_face(varies),
         uv=cat([_face_uv(m) for m in meshes], (0, 3, 2), f64),
-        atlas=_build_atlas(meshes, device),
+        atlas=build_atlas(meshes, device),
+        is_lit=per_face([m.material.shading == "lambert" for m in meshes]),
+        has_normals=per_face([m.normals is not None for m in meshes]),
+        lights=scene.lights,
+        ambient=scene.ambient.to(device, f64),
+        handedness=scene.camera.handedness,
         first_face=first,
     )
 
@@ -84,25 +89,6 @@ def _face_uv(mesh: Mesh) -> Tensor:
     if mesh.uv is None:
         return torch.zeros(mesh.n_faces, 3, 2, dtype=torch.float64, device=mesh.vertices.device)
     return mesh.uv.to(mesh.vertices.device, torch.float64)
-
-
-def _build_atlas(meshes: tuple[Mesh, ...], device: torch.device) -> Atlas:
-    """Return the textures of all meshes, opacity 1 added where a texture has none."""
-    white = torch.ones(1, 1, 4, dtype=torch.float64, device=device)
-    images = []
-    for mesh in meshes:
-        texture = mesh.material.texture
-        image = white if texture is None else texture.to(device, torch.float64)
-        opacity = torch.ones(*image.shape[:2], 4 - image.shape[2], dtype=torch.float64, device=device)
-        images.append(torch.cat([image, opacity], dim=2))
-    counts = [i.shape[0] * i.shape[1] for i in images]
-    sizes = torch.tensor([[i.shape[1], i.shape[0]] for i in images], dtype=torch.int64, device=device)
-    return Atlas(
-        texels=torch.cat([i.reshape(-1, 4) for i in images]) if images else white.reshape(1, 4),
-        first=torch.tensor([*itertools.accumulate(counts, initial=0)][:-1], dtype=torch.int64, device=device),
-        size=sizes.reshape(-1, 2).T,
-        repeats=torch.tensor([m.material.wrap == "repeat" for m in meshes], dtype=torch.bool, device=device),
-    )
 
 
 def _tie_ranks(meshes: tuple[Mesh, ...], device: torch.device) -> Tensor:

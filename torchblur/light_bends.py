@@ -1,0 +1,106 @@
+"""When lit surfaces bend in time: as they turn to or from a light, or pass the borders of a spot's cone.
+
+Before: paths.py, lights.py.  After: nodes.py.
+Symbols: K paths of lit layers; point = P / S; N the normal; V = S (light - point); the cosine has the sign of N V S;
+A the axis of a spot, and its cone of cosine c the roots of (V A)^2 = c^2 V^2 A^2.
+Source: ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchblur import bernstein
+from torchblur.lights import SpotLight
+from torchblur.paths import Paths
+from torchblur.prisms import Prisms
+
+NOISE = 1e-14  # of the product of the factors' sizes
+FLAT = 1e-9  # cosine of a cone that is a half-space
+LIMIT = 0.25  # share of its mean by which a vector may leave it, see nodes.py
+LINEAR = 0.5  # share of a cone's border (in cosine) that a path may cross, at the same place
+
+
+@dataclass(frozen=True)
+class LightPaths:
+    """Normals and vectors to the lights of lit layers over spans."""
+
+    paths: Paths  # K of them
+    normals: tuple[tuple[Tensor, Tensor], ...]  # which (n,) of the paths, (d + 1, 3, n) coefficients of N
+    vectors: tuple[Tensor, ...]  # (d + 1, 3, K) coefficients of V, light by light
+    is_near: tuple[bool, ...]  # whether V holds S, light by light
+
+    @classmethod
+    def of(cls, prisms: Prisms, paths: Paths) -> LightPaths:
+        """Return what the lit among the scene's layers, `paths`, do."""
+        world = prisms.world.index_select(-1, paths.prism)
+        place = paths.attribute(world)
+        is_smooth = prisms.surfaces.has_normals[paths.face]
+        smooth, flat = is_smooth.nonzero().flatten(), (~is_smooth).nonzero().flatten()
+        ends = prisms.normal.index_select(-1, paths.prism[smooth])
+        normals = (
+            (smooth, paths.choose(smooth).attribute(ends)),
+            (flat, _flat_normals(torch.stack([(1 - u) * world[0] + u * world[1] for u in paths.u])[..., flat])),
+        )
+        lights = prisms.surfaces.lights
+        vectors = tuple(light.path(place, paths.scale, paths.t) for light in lights)
+        return cls(paths, normals, vectors, tuple(len(v) > 2 for v in vectors))
+
+    def bends(self, prisms: Prisms) -> tuple[Tensor, Tensor]:
+        """Return the paths (B,) and times tau (B,) at which the light on them may bend."""
+        paths, taus = [self.paths.span[:0]], [self.paths.t[0, :0]]
+        for light, vector in zip(prisms.surfaces.lights, self.vectors, strict=True):
+            for which, normal in self.normals:
+                toward = vector[..., which]
+                c = bernstein.product(normal, toward).sum(1)
+                of, tau = bernstein.roots(c, NOISE * normal.abs().amax((0, 1)) * toward.abs().amax((0, 1)))
+                paths.append(which[of])
+                taus.append(tau)
+            if isinstance(light, SpotLight):
+                for of, tau in _cone_roots(light, vector, self.paths.t):
+                    paths.append(of)
+                    taus.append(tau)
+        return torch.cat(paths), torch.cat(taus)
+
+    def smooth_vectors(self, prisms: Prisms) -> list[tuple[Tensor, Tensor, float]]:
+        """Return the paths (n,), coefficients (d + 1, c, n) and the share of its mean that each vector may vary by for
+        the light to be smooth.
+        """
+        every = torch.arange(len(self.paths.span), device=self.paths.span.device)
+        found = [(which, normal, LIMIT) for which, normal in self.normals]
+        for light, vector in zip(prisms.surfaces.lights, self.vectors, strict=True):
+            limit = LIMIT
+            if isinstance(light, SpotLight):
+                inner, outer = light.cosines
+                axis = torch.stack([light.axis_at(t) for t in self.paths.t])
+                border = LINEAR * (inner - outer) if inner > outer else 1.0
+                limit = min(limit, border)
+                found.append((every, axis, limit))
+            found.append((every, vector, limit))
+        return found
+
+
+def _flat_normals(world: Tensor) -> Tensor:
+    """Return (3, 3, K) coefficients of the normals of corners (2 ends, 3 corners, 3, K) that move linearly."""
+    a, b = world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]
+    mixed = torch.linalg.cross(a[0], b[1], dim=0) + torch.linalg.cross(a[1], b[0], dim=0)
+    return torch.stack([torch.linalg.cross(a[0], b[0], dim=0), 0.5 * mixed, torch.linalg.cross(a[1], b[1], dim=0)])
+
+
+def _cone_roots(light: SpotLight, vector: Tensor, times: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """Return the paths and times at which `vector` (4, 3, K) lies on the borders of the cone."""
+    axis = torch.stack([light.axis_at(t) for t in times]).detach()
+    half = bernstein.product(vector, axis).sum(1)
+    along = bernstein.product(half, half)
+    square = bernstein.product(bernstein.product(vector, vector).sum(1), bernstein.product(axis, axis).sum(1))
+    noise = NOISE * vector.abs().amax((0, 1)).square() * axis.abs().amax((0, 1)).square()
+    found = []
+    for cosine in set(light.cosines):
+        if cosine > FLAT:
+            found.append(bernstein.roots(along - cosine**2 * square, noise))
+        else:
+            found.append(bernstein.roots(half, noise.sqrt()))
+    return found

@@ -1,0 +1,45 @@
+"""The light that a point of a surface sends to the viewer, as a share of its colour.
+
+Before: lights.py, surfaces.py.  After: shading.py.
+Symbols: K points; a corner is given in any order, `turn` tells whether that order is the face's own.
+Source: Lambert's law, radiance = albedo / pi * irradiance * cosine.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from torchblur.surfaces import Surfaces
+
+
+def flat_normal(corner: Tensor, turn: Tensor) -> Tensor:
+    """Return (3, K) normals, of the length of twice the area, of faces with `corner` (3 corners, 3, K) in world space.
+
+    They point to where the corners turn counter-clockwise, for `turn` (K,) -1 to the other side.
+    """
+    return turn * torch.linalg.cross(corner[1] - corner[0], corner[2] - corner[0], dim=0)
+
+
+def reflected(surfaces: Surfaces, point: Tensor, normal: Tensor, t: Tensor) -> Tensor:
+    """Return (K, 3): ambient + sum of irradiance / pi * cosine over the lights.
+
+    Args:
+        surfaces: whose lights shine.
+        point: (3, K) float64 world positions.
+        normal: (3, K) on the viewer's side, of any length.
+        t: (K,) shutter times.
+
+    Gradient: to points, normals and lights.
+    Source: Lambert's law.
+    """
+    square = normal.square().sum(0)
+    normal = normal / torch.where(square > 0, square, 1.0).sqrt()
+    total = surfaces.ambient.expand(point.shape[1], 3)
+    for light in surfaces.lights:
+        to_light, irradiance = light.arriving(point, t)
+        cosine = (normal * to_light).sum(0).clamp(min=0)
+        total = total + irradiance * (cosine / math.pi).unsqueeze(1)
+    return total

@@ -40,6 +40,7 @@ TORCHBLUR = [
     "texture",
     "lighting",
     "shading",
+    "averages",
     "paths",
     "texture_bends",
     "light_bends",

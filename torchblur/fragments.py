@@ -168,7 +168,7 @@ def _rasterise(
     if surfaces.has_mipmaps:
         step = 2 * ray.spacing_px / camera.width, -2 * ray.spacing_px / camera.height
         slopes = _edge_values(y, w), _edge_values(w, x)
-        slope = weight_slopes(e, slopes, step).detach()[..., kept][..., order]
+        slope = weight_slopes(e, slopes, step)[..., kept][..., order]
     return Fragments(
         offsets=packed.offsets_from_owners(owner[order], len(t) * n_pixels),
         face=face[order],

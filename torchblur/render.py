@@ -25,6 +25,7 @@ from torchblur.prisms import Prisms, build_prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
+from torchblur.subdivide import approximate
 from torchblur.surfaces import build_surfaces
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
@@ -94,8 +95,9 @@ def render(
         TypeError, ValueError: a wrong argument, named.
 
     Accuracy: geometry is solved in float64 whatever the type of the input; only the result is rounded to it.
-    Gradient: to vertices, camera, colours, opacities, background. None comes from silhouettes that do not move
-        during the exposure (see README).
+    Gradient: to vertices, normals, camera, uv, colours, opacities, textures, lights, background. None comes from
+        silhouettes that do not move during the exposure (see README). To vertices and camera only with
+        `Accuracy.exact()`.
     Source: Ronnow et al. 2021 and 2022; exactness, order and memory blocks: ours.
 
     Example:
@@ -154,6 +156,9 @@ def _checked_job(
     accuracy = Accuracy.exact() if accuracy is None else accuracy
     if not isinstance(accuracy, Accuracy):
         raise check.fail_type("accuracy", "an Accuracy", accuracy)
+    moving = [scene.camera.world_to_clip, *(mesh.vertices for mesh in scene.meshes)]
+    if accuracy.method != "exact" and torch.is_grad_enabled() and any(m.requires_grad for m in moving):
+        raise check.fail("accuracy", "Accuracy.exact(), as vertices or camera ask for gradients", accuracy.method)
     for shutter in shutters:
         if not isinstance(shutter, Shutter):
             raise check.fail_type("shutter", "a Shutter", shutter)
@@ -204,6 +209,7 @@ class _Job:
         for block, candidates in self._blocks(prisms, whole, every):
             with self.ledger.stage("intervals", device):
                 intervals, n_pairs = find_intervals(prisms, block, candidates)
+                intervals = approximate(prisms, intervals, self.accuracy)
             self.ledger.add("blocks", 1)
             self.ledger.add("pairs", n_pairs)
             self.ledger.add("intervals", intervals.count)
@@ -224,10 +230,11 @@ class _Job:
         """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`."""
         camera, device = self.scene.camera, self.scene.device
         column, row = pixel
+        is_exact = self.accuracy.method == "exact"
         lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("cells", device):
             cells = cut_cells(prisms, intervals)
-            varying = find_varying(prisms, intervals, cells, self._knots(lines))
+            varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
             lookups = count_lookups(prisms, cells, varying)
         if lookups * BYTES_PER_NODE > self.memory_bytes and len(column) > 1:
             half = len(column) // 2
@@ -243,8 +250,7 @@ class _Job:
             self.ledger.add("nodes", len(samples.cell))
             pixel_of = packed.owners(cells.offsets)[samples.cell]
             offsets = packed.offsets_from_owners(pixel_of, len(column))
-            cutoff = self.accuracy.transmittance_cutoff
-            composite = composite_samples(prisms, intervals, cells, samples, cutoff)
+            composite = composite_samples(prisms, intervals, cells, samples, self.accuracy)
             parts = []
             for shutter, line in zip(self.shutters, lines, strict=True):
                 weight = weigh_samples(shutter, cells, samples, line[pixel_of])

@@ -14,6 +14,8 @@ import torch
 from torch import Tensor
 
 from torchblur import packed
+from torchblur.accuracy import Accuracy
+from torchblur.averages import look_over
 from torchblur.cells import Cells
 from torchblur.intervals import Intervals
 from torchblur.nodes import Samples
@@ -40,7 +42,9 @@ class Resolved:
     coverage: Tensor  # (pixels, M) float64 share of the exposure in which each mesh is visible
 
 
-def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, samples: Samples, cutoff: float) -> Composite:
+def composite_samples(
+    prisms: Prisms, intervals: Intervals, cells: Cells, samples: Samples, accuracy: Accuracy
+) -> Composite:
     """Return what every sample shows, front to back.
 
     Args:
@@ -48,9 +52,9 @@ def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, sample
         intervals: from which the cells were cut.
         cells: with layers nearest first.
         samples: of the cells.
-        cutoff: transmittance at which a ray ends; see `packed.transmittance`.
+        accuracy: whether layers are looked at at the samples' times, or on average over the cells; where rays end.
 
-    Accuracy: opacities are multiplied at each time, never their means; with a cut-off, see `Accuracy`.
+    Accuracy: exactly, opacities are multiplied at each time, never their means; else see `Accuracy`.
     Gradient: to colour, opacity, texture, normals, lights, and through the samples' times.
     Source: Ronnow et al. 2021, alg. 1.
     """
@@ -59,10 +63,13 @@ def composite_samples(prisms: Prisms, intervals: Intervals, cells: Cells, sample
     offsets = packed.offsets_from_counts(counts)
     surfaces, interval = prisms.surfaces, cells.layer_interval[layer]
     face = prisms.face_of[intervals.prism[interval]]
-    which = needing_points(surfaces, face)
-    points = points_on_prisms(prisms, intervals, interval[which], samples.t[sample[which]])
-    rgb, alpha = look(surfaces, face, which, points)
-    before, after = packed.transmittance(alpha, offsets, cutoff)
+    if accuracy.method == "exact":
+        which = needing_points(surfaces, face)
+        points = points_on_prisms(prisms, intervals, interval[which], samples.t[sample[which]])
+        rgb, alpha = look(surfaces, face, which, points)
+    else:
+        rgb, alpha = look_over(prisms, intervals, cells, (samples.cell[sample], interval))
+    before, after = packed.transmittance(alpha, offsets, accuracy.transmittance_cutoff)
     light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
     n_meshes = max(1, len(surfaces.first_face))
     visible = ((before.detach() > 0) & (alpha.detach() > 0)).nonzero().flatten()

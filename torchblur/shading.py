@@ -26,7 +26,7 @@ class Points:
 
     face: Tensor  # (J,) int64
     weight: Tensor  # (3, J) float64 barycentrics of the corners
-    slope: Tensor  # (2, 3, J) their change from one ray to the next along x and y; no gradient; (2, 3, 0) without mips
+    slope: Tensor  # (2, 3, J) their change from one ray to the next along x and y; (2, 3, 0) without mips
     uv: Tensor  # (2, 3, J) of the corners
     world: Tensor  # (3 corners, 3, J) positions; (3, 3, 0) where nothing is lit
     normal: Tensor  # (3 corners, 3, J) normals, of any length; or as `world`
@@ -61,13 +61,13 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tup
         corner_uv = points.uv[..., textured]
         level = torch.zeros(len(of), dtype=torch.float64, device=of.device)
         if points.slope.shape[-1]:
-            level = mip_level(surfaces, own, (points.slope[..., textured].unsqueeze(0) * corner_uv.unsqueeze(1)).sum(2))
+            level = mip_level(surfaces, own, uv_slopes(points, textured))
         rgba = lookup(surfaces, own, (points.weight[:, textured] * corner_uv).sum(1), level)
         rgb = rgb.index_put((of,), rgb[of] * rgba[:, :3])
         alpha = alpha.index_put((of,), alpha[of] * rgba[:, 3])
     lit = surfaces.is_lit[points.face].nonzero().flatten()
     if len(lit):
-        light = reflected(surfaces, *_position_and_normal(surfaces, points, lit), points.t[lit])
+        light = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit])
         rgb = rgb.index_put((which[lit],), rgb[which[lit]] * light)
     return rgb, alpha
 
@@ -86,7 +86,7 @@ def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: 
     scale = e.sum(0)
     slope = e.new_zeros(2, 3, 0)
     if prisms.surfaces.has_mipmaps:
-        slope = _slopes((x, y, w), intervals.spacing_ndc).detach()
+        slope = _slopes((x, y, w), intervals.spacing_ndc)
     is_lit = prisms.world.shape[-1] > 0
     moving = (c.index_select(-1, prism) if is_lit else c for c in (prisms.world, prisms.normal))
     world, normal = ((1 - u) * c[0] + u * c[1] if is_lit else c[0] for c in moving)
@@ -120,6 +120,11 @@ def weight_slopes(e: Tensor, slopes: tuple[Tensor, Tensor], spacing: tuple[float
     )
 
 
+def uv_slopes(points: Points, chosen: Tensor) -> Tensor:
+    """Return (2 uv, 2 axes, n) the change of uv from one ray to the next at the points `chosen` (n,). Ours."""
+    return (points.slope[..., chosen].unsqueeze(0) * points.uv[..., chosen].unsqueeze(1)).sum(2)
+
+
 def corner_uv(prisms: Prisms, prism: Tensor) -> Tensor:
     """Return (2, 3, K) texture coordinates of the corners of prisms `prism` (K,) in their stored order. Ours."""
     face, order = prisms.face_of[prism], prisms.corner_of[:, prism]
@@ -132,8 +137,11 @@ def _slopes(corners: tuple[Tensor, Tensor, Tensor], spacing: tuple[float, float]
     return weight_slopes(edges.edges_of(x, y), (edges.edges_of(y, w), edges.edges_of(w, x)), spacing)
 
 
-def _position_and_normal(surfaces: Surfaces, points: Points, lit: Tensor) -> tuple[Tensor, Tensor]:
-    """Return world positions and normals on the viewer's side, of any length, (3, I) each, of the points `lit` (I,)."""
+def position_and_normal(surfaces: Surfaces, points: Points, lit: Tensor) -> tuple[Tensor, Tensor]:
+    """Return world positions and normals on the viewer's side, of any length, (3, I) each, of the points `lit` (I,).
+
+    Source: Ronnow et al. 2022, eq. 2.
+    """
     weight, world = points.weight[:, lit].unsqueeze(1), points.world[..., lit]
     normal = flat_normal(world, points.turn[lit])
     smooth = (weight * points.normal[..., lit]).sum(0)

@@ -19,28 +19,41 @@ def to_texels(uv: Tensor, size: Tensor) -> Tensor:
     return torch.stack([uv[0] * size[0] - 0.5, (1 - uv[1]) * size[1] - 0.5])
 
 
-def mip_level(surfaces: Surfaces, face: Tensor, slope: Tensor) -> Tensor:
-    """Return the levels (K,) of lookups: log2 of the root mean square of the axes of the ray's footprint in texels.
+def footprint(size: Tensor, slope: Tensor) -> Tensor:
+    """Return the root mean square (K,) of the axes of the rays' footprints [texels].
 
-    Unlike the longer axis alone, the mean square is smooth and does not change when the image is turned.
+    Unlike the longer axis alone, it is smooth and does not change when the image is turned.
+
+    Args:
+        size: (2, K) of the textures.
+        slope: (2 uv, 2 screen axes, K) change of uv from one ray to the next.
+
+    Source: ours.
+    """
+    square = 0.5 * (size.unsqueeze(1) * slope).square().sum((0, 1))
+    is_there = square > 0
+    return torch.where(is_there, torch.where(is_there, square, 1.0).sqrt(), 0.0)
+
+
+def mip_level(surfaces: Surfaces, face: Tensor, slope: Tensor) -> Tensor:
+    """Return the levels (K,) of lookups: log2 of the footprint, from 0 to the last.
 
     Args:
         surfaces: appearance of the faces.
         face: (K,) int64.
-        slope: (2 uv, 2 screen axes, K) change of uv from one ray to the next.
+        slope: as in `footprint`.
 
-    Source: Williams 1983; mean square of the axes: ours.
+    Source: Williams 1983.
     """
     atlas, mesh = surfaces.atlas, surfaces.mesh_of[face]
-    square = 0.5 * (atlas.size[0][:, mesh].unsqueeze(1) * slope).square().sum((0, 1))
-    level = 0.5 * torch.log2(square.clamp(min=1.0))
+    level = torch.log2(footprint(atlas.size[0][:, mesh], slope).clamp(min=1.0))
     return torch.minimum(level, (atlas.n_levels[mesh] - 1).to(level.dtype))
 
 
 def lookup(surfaces: Surfaces, face: Tensor, uv: Tensor, level: Tensor) -> Tensor:
     """Return (K, 4) linear RGB and opacity of the textures of `face` (K,) at `uv` (2, K) and `level` (K,).
 
-    Gradient: to the texels and, except where it bends, to the place; none to the level.
+    Gradient: to the texels and, except where it bends, to place and level.
     Source: trilinear interpolation.
     """
     fine = level.detach().floor()
@@ -49,7 +62,7 @@ def lookup(surfaces: Surfaces, face: Tensor, uv: Tensor, level: Tensor) -> Tenso
     if len(blended) == 0:
         return looked
     coarse = _bilinear(surfaces, face[blended], uv[:, blended], fine[blended].long() + 1)
-    share = (level.detach() - fine)[blended].unsqueeze(1)
+    share = (level - fine)[blended].unsqueeze(1)
     return looked.index_put((blended,), (1 - share) * looked[blended] + share * coarse)
 
 

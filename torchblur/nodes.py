@@ -38,6 +38,9 @@ BOUND = 40.0  # 64 / 15 / 2 times the most by which a look can exceed its size w
 ROUNDING = 1e-13  # of the mean of a q: smaller coefficients are rounding
 SCALE_LIMIT = 0.5  # share of its mean by which S may vary
 MAX_DEGREE = 15  # of a look: six layers with textured opacity in a cell; beyond, the certificate is a rule of thumb
+FEW, FEW_LIT = 3, 8  # nodes that panels of textured and of lit layers take on average, or fewer
+BYTES_PER_LOOK = 900  # of place_samples and composite_samples, a layer of a sample, with textures and lights
+BYTES_PER_LAYER = 400  # the same, with neither
 MAX_HALVINGS = 16  # towards a time at which a q vanishes (a face seen edge-on); what is looked at stays finite there
 MANY, FREE_HALVINGS = 8, 4  # panels of a span that may fail after so many halvings; more are noise, and accepted
 
@@ -114,15 +117,18 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
 
 
 @torch.no_grad()
-def count_lookups(prisms: Prisms, cells: Cells, varying: Varying | None) -> int:
-    """Return about how many looks at layers the cells will take: an estimate, for memory. Source: ours."""
+def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> int:
+    """Return about how much memory the samples of the cells will take at their peak [bytes]. Source: ours."""
     n_layers = cells.layer_offsets.diff()
+    total = int(n_layers.sum())
+    surfaces = prisms.surfaces
     if varying is None:
-        return int(n_layers.sum())
+        return total * (BYTES_PER_LOOK if (surfaces.is_textured | surfaces.is_lit).any() else BYTES_PER_LAYER)
     lines = varying.textured.count_lines(prisms)
     panels = torch.ones_like(varying.start).index_add(0, varying.textured.paths.span, lines)
-    nodes = torch.where(varying.degree > 1, 4, 8)
-    return int((panels * nodes * n_layers[varying.cell]).sum())
+    nodes = torch.full_like(panels, FEW)
+    nodes[varying.lit.paths.span] = FEW_LIT
+    return total * BYTES_PER_LAYER + int((panels * nodes * n_layers[varying.cell]).sum()) * BYTES_PER_LOOK
 
 
 @torch.no_grad()

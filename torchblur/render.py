@@ -19,7 +19,7 @@ from torchblur.accuracy import Accuracy
 from torchblur.camera import MAX_RAYS, Ray, pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
-from torchblur.nodes import count_lookups, find_varying, place_samples
+from torchblur.nodes import estimate_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
@@ -30,7 +30,6 @@ from torchblur.surfaces import build_surfaces
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 BYTES_PER_LAYER = 260  # peak of cut_cells, a layer
-BYTES_PER_NODE = 500  # peak of place_samples and composite_samples, a layer of a sample
 MIN_MEMORY_BYTES = 1 << 20
 COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "nodes", "deepest_pixel")
 STAGES = ("prisms", "intervals", "cells", "resolve")
@@ -235,8 +234,8 @@ class _Job:
         with self.ledger.stage("cells", device):
             cells = cut_cells(prisms, intervals)
             varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
-            lookups = count_lookups(prisms, cells, varying)
-        if lookups * BYTES_PER_NODE > self.memory_bytes and len(column) > 1:
+            n_bytes = estimate_bytes(prisms, cells, varying)
+        if n_bytes > self.memory_bytes and len(column) > 1:
             half = len(column) // 2
             parts = []
             for chosen in torch.arange(len(column), device=device).split([half, len(column) - half]):

@@ -25,7 +25,7 @@ MAX_HALVINGS = 12  # of a piece between two extrema; what is left is accepted
 MIN_PIECE = 1e-9  # of the window; shorter pieces are not cut: a pixel changes by at most as much a piece
 ROUNDING = 1e-12  # of nearness and uv: smaller slopes and errors are rounding
 VANISHING = 1e-10  # of the largest coefficient: S below it is 0, as e_i are known to about 1e-12
-AT_ONCE = 1 << 14  # intervals cut together; fits the cache, and bounds the working memory
+AT_ONCE = 1 << 16  # intervals cut together; fits the cache, and bounds the working memory
 INSIDE = 1e-6  # of an interval: how far from an instant without depth the depth is looked at
 
 
@@ -120,7 +120,6 @@ def approximate(prisms: Prisms, intervals: Intervals, accuracy: Accuracy) -> Int
         near_num=near_num,
         near_den=torch.ones_like(near_num),
         ray_ndc=intervals.ray_ndc,
-        spacing_ndc=intervals.spacing_ndc,
     )
 
 

@@ -31,7 +31,7 @@ def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
         texture = np.load(folder / "texture.npy", allow_pickle=False)[::-1]  # stored with row 0 at v = 0
         uv = torch.as_tensor(s["uv"])
     color, opacity = torch.as_tensor(s["face_color"]), torch.as_tensor(s["face_opacity"])
-    material = tb.Material(color, opacity, texture=texture, wrap="clamp")
+    material = tb.Material(color, opacity, texture=texture, wrap="clamp", mipmap=False)
     mesh = tb.Mesh(vertices, torch.as_tensor(s["faces"]), material, uv=uv)
     camera = tb.Camera(torch.as_tensor(s["world_to_clip"]), int(s["width"]), int(s["height"]))
     scene = tb.Scene([mesh], camera, torch.as_tensor(s["background"]))

@@ -15,6 +15,7 @@ from oracles import PlainScene
 
 import torchblur as tb
 from torchblur import bernstein, cells, packed
+from torchblur.camera import CENTRE
 from torchblur.intervals import find_intervals
 from torchblur.pairs import Block
 from torchblur.prisms import build_prisms
@@ -31,7 +32,7 @@ def covered(scene):
     """The prisms of a scene and the intervals of all its pixels."""
     camera = scene.camera
     prisms = build_prisms(scene, build_surfaces(scene), (0.0, 1.0))
-    block = Block(0, 0, camera.width, camera.height, (0.5, 0.5), camera.width, camera.height)
+    block = Block(0, 0, camera.width, camera.height, CENTRE, camera.width, camera.height)
     return prisms, find_intervals(prisms, block, torch.arange(prisms.count))[0]
 
 

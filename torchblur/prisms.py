@@ -48,6 +48,10 @@ class Prisms:
         """Number of prisms."""
         return len(self.face_of)
 
+    def corner_uv(self, prism: Tensor) -> Tensor:
+        """Return (2, 3, K) texture coordinates of the corners of prisms `prism` (K,) in their stored order."""
+        return self.surfaces.uv[self.face_of[prism], self.corner_of[:, prism]].permute(2, 0, 1)
+
 
 def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) -> Prisms:
     """Return the prisms of all faces that can be seen in a window of time.

@@ -95,7 +95,7 @@ def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: 
         face=prisms.face_of[prism],
         weight=e / scale,
         slope=slope,
-        uv=corner_uv(prisms, prism),
+        uv=prisms.corner_uv(prism),
         world=world,
         normal=normal,
         turn=parity,
@@ -123,12 +123,6 @@ def weight_slopes(e: Tensor, slopes: tuple[Tensor, Tensor], spacing: tuple[float
 def uv_slopes(points: Points, chosen: Tensor) -> Tensor:
     """Return (2 uv, 2 axes, n) the change of uv from one ray to the next at the points `chosen` (n,). Ours."""
     return (points.slope[..., chosen].unsqueeze(0) * points.uv[..., chosen].unsqueeze(1)).sum(2)
-
-
-def corner_uv(prisms: Prisms, prism: Tensor) -> Tensor:
-    """Return (2, 3, K) texture coordinates of the corners of prisms `prism` (K,) in their stored order. Ours."""
-    face, order = prisms.face_of[prism], prisms.corner_of[:, prism]
-    return torch.stack([prisms.surfaces.uv[face, corner] for corner in order]).permute(2, 0, 1)
 
 
 def _slopes(corners: tuple[Tensor, Tensor, Tensor], spacing: tuple[float, float]) -> Tensor:

@@ -120,6 +120,7 @@ def approximate(prisms: Prisms, intervals: Intervals, accuracy: Accuracy) -> Int
         near_num=near_num,
         near_den=torch.ones_like(near_num),
         ray_ndc=intervals.ray_ndc,
+        spacing_ndc=intervals.spacing_ndc,
     )
 
 
@@ -207,8 +208,7 @@ def _curves(prisms: Prisms, intervals: Intervals, chosen: Tensor, has_uv: bool) 
     corners = edges.reduce_corners(prisms.clip, prism, ray).between(u[0], u[1])
     num, den = nearness_coefficients(replace(prisms, orders_by_w=False), prism, corners, u)
     e = edges.edge_coefficients(corners)  # (3 coefficients, 3 edges, m)
-    uv = prisms.surfaces.uv[prisms.face_of[prism], prisms.corner_of[:, prism]]  # (3 corners, m, 2)
-    p = torch.stack([(e * uv[..., axis]).sum(1) for axis in range(2)], dim=1) if has_uv else e[:, :0]
+    p = torch.stack([(e * uv).sum(1) for uv in prisms.corner_uv(prism)], dim=1) if has_uv else e[:, :0]
     return _finite_ends(_Curves(num, den, e.sum(1, keepdim=True), p))
 
 

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchblur import bernstein, edges, packed
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
-from torchblur.shading import corner_uv
 from torchblur.texture import to_texels
 
 NOISE = 1e-14  # of the largest coefficient: rounding of products of degree 8
@@ -34,7 +33,7 @@ class TexturePaths:
     @classmethod
     def of(cls, prisms: Prisms, paths: Paths) -> TexturePaths:
         """Return the places of the textured among `paths`."""
-        uv = corner_uv(prisms, paths.prism)
+        uv = prisms.corner_uv(paths.prism)
         atlas, mesh = prisms.surfaces.atlas, prisms.surfaces.mesh_of[paths.face]
         level = torch.zeros(2, len(mesh), dtype=torch.float64, device=mesh.device)
         mipped = (atlas.n_levels[mesh] > 1).nonzero().flatten()

@@ -41,6 +41,7 @@ TORCHBLUR = [
     "lighting",
     "shading",
     "averages",
+    "certificate",
     "paths",
     "texture_bends",
     "light_bends",

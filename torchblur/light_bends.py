@@ -14,13 +14,13 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein
+from torchblur.certificate import VECTOR_LIMIT
 from torchblur.lights import SpotLight
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
 
 NOISE = 1e-14  # of the product of the factors' sizes
 FLAT = 1e-9  # cosine of a cone that is a half-space
-LIMIT = 0.25  # share of its mean by which a vector may leave it, see nodes.py
 LINEAR = 0.5  # share of a cone's border (in cosine) that a path may cross, at the same place
 
 
@@ -70,9 +70,9 @@ class LightPaths:
         the light to be smooth.
         """
         every = torch.arange(len(self.paths.span), device=self.paths.span.device)
-        found = [(which, normal, LIMIT) for which, normal in self.normals]
+        found = [(which, normal, VECTOR_LIMIT) for which, normal in self.normals]
         for light, vector in zip(prisms.surfaces.lights, self.vectors, strict=True):
-            limit = LIMIT
+            limit = VECTOR_LIMIT
             if isinstance(light, SpotLight):
                 inner, outer = light.cosines
                 axis = torch.stack([light.axis_at(t) for t in self.paths.t])

@@ -1,16 +1,10 @@
 """Choose the times at which the cells of a ray are looked at: one for a flat cell, Gauss's nodes where looks vary.
 
 Before: texture_bends.py, light_bends.py.  After: resolve.py.
-Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), spans (see paths.py), p
-panels (slices of a span in which no look bends), n nodes of a panel, d the degree of a look in texels; q vectors of
-polynomials that looks divide by: S, footprints, normals, vectors to lights.
-
-Certificate: on a panel, look at q through its Chebyshev coefficients c_0, c_1, ... On the ellipse about the panel
-whose semi-axes add up to rho, q leaves c_0 by at most sum_k>0 |c_k| (rho^k + rho^-k) / 2. Where that is a set share of
-|c_0| for all q, the looks are analytic inside the ellipse and grow by at most (1 + rho / 2)^d, and Gauss's rule errs by
-at most BOUND (1 + rho / 2)^d rho^(-2 n) (Trefethen, theorem 19.3). Panels get the fewest nodes for which that is below
-TOLERANCE; those for which the most do not suffice are halved.
-Source: Trefethen 2013, Approximation Theory and Approximation Practice (Gauss's rule on analytic functions); ours.
+Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), spans (see paths.py), p panels
+(slices of a span in which no look bends). Panels get as many nodes as certificate.py asks for; those for which the most
+do not suffice are halved.
+Source: Gauss-Legendre quadrature; ours.
 """
 
 from __future__ import annotations
@@ -22,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchblur import bernstein, packed
 from torchblur.cells import Cells
+from torchblur.certificate import SCALE_LIMIT, VECTOR_LIMIT, Divider, nodes_needed
 from torchblur.intervals import Intervals
 from torchblur.light_bends import LightPaths
 from torchblur.paths import Paths, between, cut_spans, follow
@@ -32,12 +26,7 @@ from torchblur.shading import needing_points
 from torchblur.sort import argsort_by
 from torchblur.texture_bends import TexturePaths
 
-COUNTS = (1, 2, 3, 4, 6, 8, 12, 16)  # nodes of a panel
-TOLERANCE = 1e-6  # of what is looked at: the contrast of a texture between neighbours, the light on a facing surface
-BOUND = 40.0  # 64 / 15 / 2 times the most by which a look can exceed its size while all q stay within their shares
-ROUNDING = 1e-13  # of the mean of a q: smaller coefficients are rounding
-SCALE_LIMIT = 0.5  # share of its mean by which S may vary
-MAX_DEGREE = 15  # of a look: six layers with textured opacity in a cell; beyond, the certificate is a rule of thumb
+COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)  # nodes of a panel
 FEW, FEW_LIT = 3, 8  # nodes that panels of textured and of lit layers take on average, or fewer
 BYTES_PER_LOOK = 900  # of place_samples and composite_samples, a layer of a sample, with textures and lights
 BYTES_PER_LAYER = 400  # the same, with neither
@@ -62,7 +51,6 @@ class Varying:
     cell: Tensor  # (n,) int64 cell of each span
     start: Tensor  # (n,) share of the cell
     end: Tensor  # (n,)
-    degree: Tensor  # (n,) int64 of the looks of the span's cell
     paths: Paths
     textured: TexturePaths
     which_textured: Tensor  # which of the paths
@@ -98,18 +86,12 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
     which_textured = surfaces.is_textured[paths.face].nonzero().flatten()
     is_lit = surfaces.is_lit[paths.face] if surfaces.lights else torch.zeros_like(paths.span, dtype=torch.bool)
     which_lit = is_lit.nonzero().flatten()
-    textured = TexturePaths.of(prisms, paths.choose(which_textured))
-    span = textured.paths.span
-    own = torch.zeros_like(spans.cell).scatter_reduce(0, span, torch.full_like(span, 2), "amax")
-    own.scatter_reduce_(0, span[textured.mipped], torch.full_like(textured.mipped, 3), "amax")
-    varies = surfaces.has_varying_opacity[textured.paths.face].long()
     return Varying(
         cell=spans.cell,
         start=spans.start,
         end=spans.end,
-        degree=(own.index_add(0, span, 2 * varies) + 1).clamp(max=MAX_DEGREE),  # 1 for the shutter
         paths=paths,
-        textured=textured,
+        textured=TexturePaths.of(prisms, paths.choose(which_textured)),
         which_textured=which_textured,
         lit=LightPaths.of(prisms, paths.choose(which_lit)),
         which_lit=which_lit,
@@ -140,14 +122,14 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
         cells: with their visible layers.
         varying: of `find_varying`.
 
-    Accuracy: TOLERANCE, certified; see the top of the file.
-    Source: Trefethen 2013; ours.
+    Accuracy: certificate.TOLERANCE, certified.
+    Source: Gauss-Legendre quadrature; ours.
     """
     if varying is None:
         return middle_samples(cells)
     device = cells.t_start.device
     panels = _cut_panels(prisms, varying)
-    owner, start, end, n_nodes = _count_nodes(_dividers(prisms, varying), varying, panels)
+    owner, start, end, n_nodes = _count_nodes(prisms, varying, panels)
     owners, taus, shares = [], [], []
     for n in COUNTS:
         chosen = (n_nodes == n).nonzero().flatten()
@@ -189,40 +171,32 @@ def _cut_panels(prisms: Prisms, varying: Varying) -> tuple[Tensor, Tensor, Tenso
     return between(torch.cat(owners), torch.cat(taus))
 
 
-def _dividers(prisms: Prisms, varying: Varying) -> list[tuple[Tensor, Tensor, float]]:
-    """Return the q: the spans (m,) they belong to, sorted, coefficients (d + 1, c, m), and how far they may vary."""
+def _dividers(prisms: Prisms, varying: Varying) -> list[Divider]:
+    """Return what the looks divide by."""
     textured, lit = varying.textured, varying.lit
     scaled = torch.zeros_like(varying.paths.span, dtype=torch.bool)
     scaled[varying.which_textured] = True
     if any(lit.is_near):
         scaled[varying.which_lit] = True
     scaled = scaled.nonzero().flatten()
-    found = [(varying.paths.span[scaled], varying.paths.scale[:, scaled].unsqueeze(1), SCALE_LIMIT)]
-    found.append((textured.paths.span[textured.mipped], textured.slope, SCALE_LIMIT / 2))
-    found += [(lit.paths.span[which], q, limit) for which, q, limit in lit.smooth_vectors(prisms)]
-    return [f for f in found if len(f[0])]
+    found = [Divider(varying.paths.span[scaled], varying.paths.scale[:, scaled].unsqueeze(1), SCALE_LIMIT)]
+    found.append(Divider(textured.paths.span[textured.mipped], textured.slope, VECTOR_LIMIT))
+    found += [Divider(lit.paths.span[which], q, limit) for which, q, limit in lit.smooth_vectors(prisms)]
+    return [f for f in found if len(f.span)]
 
 
 def _count_nodes(
-    dividers: list[tuple[Tensor, Tensor, float]], varying: Varying, panels: tuple[Tensor, Tensor, Tensor]
+    prisms: Prisms, varying: Varying, panels: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return panels, halved where necessary, and their numbers of nodes (p,)."""
     n_spans = len(varying.cell)
-    offsets = [packed.offsets_from_owners(owner, n_spans) for owner, _, _ in dividers]
-    table = torch.tensor(_least_rho(), dtype=torch.float64, device=varying.start.device)  # (counts, degrees)
-    counts = torch.tensor([*COUNTS, COUNTS[-1]], device=table.device)
+    dividers, lookup = _dividers(prisms, varying), varying.textured.finest_lookup(prisms)
+    counts = torch.tensor([*COUNTS, COUNTS[-1]], device=varying.start.device)
     done = []
     for k in range(MAX_HALVINGS + 1):
         span, start, end = panels
-        rho = table[:, varying.degree[span]]  # (counts, p)
-        passes = torch.isfinite(rho)
-        for (_, q, limit), own in zip(dividers, offsets, strict=True):
-            index, of = packed.expand(own[span], own.diff()[span])
-            sizes = _chebyshev_sizes(bernstein.restrict(q[..., index], start[of], end[of]))
-            for i in range(len(COUNTS)):
-                fails = _tail(sizes, rho[i, of]) > limit * sizes[0]
-                passes[i, of[fails]] = False
-        place = (~passes).long().cumprod(0).sum(0)  # of the first count that passes
+        needed = nodes_needed(dividers, lookup, panels, n_spans)
+        place = torch.searchsorted(counts[:-1].to(needed.dtype), needed)
         is_ready = place < len(COUNTS)
         if k >= FREE_HALVINGS:
             failing = torch.bincount(span[~is_ready], minlength=n_spans)
@@ -236,43 +210,3 @@ def _count_nodes(
         middle = 0.5 * (start + end)
         panels = torch.cat([span, span]), torch.cat([start, middle]), torch.cat([middle, end])
     return tuple(torch.cat(parts) for parts in zip(*done, strict=True))
-
-
-def _chebyshev_sizes(q: Tensor) -> Tensor:
-    """Return (d + 1, m) the lengths of the Chebyshev coefficients of vectors (d + 1, c, m) in Bernstein form."""
-    to_chebyshev = torch.as_tensor(_chebyshev_matrix(len(q) - 1), device=q.device)
-    return torch.einsum("kj,jcm->kcm", to_chebyshev, q).norm(dim=1)
-
-
-@cache
-def _chebyshev_matrix(degree: int) -> np.ndarray:
-    """Return the (d + 1, d + 1) matrix from Bernstein to Chebyshev coefficients on the same range."""
-    nodes = np.cos(np.pi * (np.arange(degree + 1) + 0.5) / (degree + 1))
-    u = 0.5 * (nodes + 1)
-    binomial = np.cumprod([1.0, *((degree - k) / (k + 1) for k in range(degree))])
-    values = np.stack([binomial[k] * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)], axis=1)
-    chebyshev = np.stack([np.cos(k * np.arccos(nodes)) for k in range(degree + 1)], axis=1)
-    return np.linalg.solve(chebyshev, values)
-
-
-def _tail(sizes: Tensor, rho: Tensor) -> Tensor:
-    """Return (m,) the most by which a q can leave its mean on the ellipse of `rho` (m,)."""
-    total = torch.zeros_like(rho)
-    for k in range(1, len(sizes)):
-        grown = 0.5 * sizes[k] * (rho**k + rho**-k)
-        total = total + torch.where(sizes[k] > ROUNDING * sizes[0], grown, 0.0)
-    return total
-
-
-@cache
-def _least_rho() -> list[list[float]]:
-    """Return the least rho for each of COUNTS and degrees 0 to MAX_DEGREE; infinite where no rho suffices."""
-    rows = []
-    for n in COUNTS:
-        row = []
-        for degree in range(MAX_DEGREE + 1):
-            grid = np.geomspace(1.01, 1e9, 4001)
-            fits = BOUND * (1 + grid / 2) ** degree * grid ** (-2.0 * n) / (1 - grid**-2) <= TOLERANCE
-            row.append(float(grid[fits.argmax()]) if fits.any() else np.inf)
-        rows.append(row)
-    return rows

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein, edges, packed
+from torchblur.certificate import Lookup
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
 from torchblur.texture import to_texels
@@ -66,6 +67,15 @@ class TexturePaths:
                 low, high = torch.maximum(low, ratio_low).ceil(), torch.minimum(high, ratio_high).floor()
                 found.append((which, place, low, high))
         return found
+
+    def finest_lookup(self, prisms: Prisms) -> Lookup:
+        """Return the places in texels of the least level at which each path may be looked up."""
+        surfaces = prisms.surfaces
+        size = surfaces.atlas.size[self.level[0].long(), :, surfaces.mesh_of[self.paths.face]].T.to(torch.float64)
+        texel = to_texels(self.uv, size.unsqueeze(1))
+        place = torch.stack([(self.paths.e * axis).sum(1) for axis in texel], dim=1)
+        multiplies = surfaces.has_varying_opacity[self.paths.face]
+        return Lookup(self.paths.span, place, self.paths.scale, multiplies)
 
     def count_lines(self, prisms: Prisms) -> Tensor:
         """Return about how many lines (K,) each path crosses."""

@@ -78,7 +78,8 @@ class SpotLight:
         position, target: (3,) or (K+1, 3) floats [scene units]; the axis runs from one to the other.
         intensity: a number or (3,) linear RGB, at least 0, along the axis [W/sr].
         inner_angle_deg, outer_angle_deg: from the axis [degrees], 0 <= inner <= outer, 0 < outer <= 90; between them
-            the light falls by the square of a linear function of the angle's cosine; equal angles are a hard border.
+            the light falls by the square of a linear function of the angle's cosine; equal angles are a hard border,
+            through which no gradient passes.
 
     Raises:
         TypeError, ValueError: a wrong argument, named; a target at the position.

@@ -113,7 +113,8 @@ class Scene:
     """Meshes, a camera, what lights them and what is behind them.
 
     A face of shading "lambert" shows its colour times (ambient + sum of irradiance / pi * cosine) over the lights: with
-    its own normal turned to the viewer, or with the mesh's vertex normals (negated where the back of the face is seen).
+    its own normal turned to the viewer, or with the mesh's vertex normals, negated where the eye sees the back of the
+    face, from which its corners turn clockwise.
     Lights cast no shadows.
 
     Args:

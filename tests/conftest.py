@@ -8,6 +8,7 @@ import torch
 from hypothesis import settings
 
 settings.register_profile("fixed", derandomize=True, deadline=None, max_examples=25)
+settings.register_profile("slow", derandomize=True, deadline=None, max_examples=5000)  # --hypothesis-profile=slow
 settings.load_profile("fixed")
 torch.set_num_threads(1)  # the tensors of tests are tiny: threads would only wait for each other
 

@@ -76,7 +76,9 @@ def _two_lookups(surfaces: Surfaces, ends: tuple[Points, Points], share: Tensor,
     size = surfaces.atlas.size[0][:, surfaces.mesh_of[face]]
     minor = torch.ones(len(face), dtype=torch.float64, device=face.device)
     if ends[0].slope.shape[-1]:
-        minor = footprint(size, uv_slopes(ends[0], textured)).detach().clamp(min=1.0)
+        has_levels = surfaces.atlas.n_levels[surfaces.mesh_of[face]] > 1
+        wide = footprint(size, uv_slopes(ends[0], textured)).detach().clamp(min=1.0)
+        minor = torch.where(has_levels, wide, minor)
     halves = [_anisotropic(surfaces, face, way, minor) for way in ((first, middle), (middle, last))]
     rgba = 0.5 * (halves[0] + halves[1])
     opacity = rgba[:, 3:]

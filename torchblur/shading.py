@@ -84,6 +84,7 @@ def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: 
     x, y, w = edges.reduce_corners(prisms.clip, prism, ray).at(u)
     e = edges.edges_of(x, y)
     scale = e.sum(0)
+    is_seen = scale != 0  # what has become a line may cover the ray for a rounding error
     slope = e.new_zeros(2, 3, 0)
     if prisms.surfaces.has_mipmaps:
         slope = _slopes((x, y, w), intervals.spacing_ndc)
@@ -93,7 +94,7 @@ def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: 
     parity = prisms.parity[prism]
     return Points(
         face=prisms.face_of[prism],
-        weight=e / scale,
+        weight=torch.where(is_seen, e / torch.where(is_seen, scale, 1.0), 1 / 3),
         slope=slope,
         uv=prisms.corner_uv(prism),
         world=world,
@@ -115,9 +116,8 @@ def weight_slopes(e: Tensor, slopes: tuple[Tensor, Tensor], spacing: tuple[float
     Source: quotient rule.
     """
     scale = e.sum(0)
-    return torch.stack(
-        [(scale * d - e * d.sum(0)) * (step / scale.square()) for d, step in zip(slopes, spacing, strict=True)]
-    )
+    square = torch.where(scale != 0, scale.square(), 1.0)  # a line has none, see `points_on_prisms`
+    return torch.stack([(scale * d - e * d.sum(0)) * (step / square) for d, step in zip(slopes, spacing, strict=True)])
 
 
 def uv_slopes(points: Points, chosen: Tensor) -> Tensor:

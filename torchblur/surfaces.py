@@ -98,13 +98,20 @@ def _tie_ranks(meshes: tuple[Mesh, ...], device: torch.device) -> Tensor:
         with torch.no_grad():
             knots = mesh.vertices.to(torch.float64)
             knots = knots if knots.ndim == 3 else knots.unsqueeze(0)
-            content = (knots[:, mesh.faces] + 0.0).contiguous().view(torch.int64)  # (knots, F, 3, 3); -0.0 becomes 0.0
+            content = [*knots[:, mesh.faces]]  # (F, 3 corners, numbers) each
+            if mesh.normals is not None:
+                normals = mesh.normals.to(device, torch.float64)
+                content += [*(normals if normals.ndim == 3 else normals.unsqueeze(0))[:, mesh.faces]]
+            if mesh.uv is not None:
+                content.append(mesh.uv.to(device, torch.float64))
             corner = torch.zeros(mesh.n_faces, 3, dtype=torch.int64, device=device)
-            for numbers in content:
-                for axis in range(3):
-                    corner = _mix(corner ^ numbers[..., axis])
+            for part in content:
+                for numbers in (part + 0.0).contiguous().view(torch.int64).unbind(2):  # -0.0 becomes 0.0
+                    corner = _mix(corner ^ numbers)
             look = torch.cat([mesh.face_rgb(), mesh.face_opacity().unsqueeze(1)], dim=1) + 0.0
-            key = corner.sum(1) + int(mesh.material.double_sided)
+            material = mesh.material
+            flags = (material.double_sided, material.mipmap, material.wrap == "clamp", material.shading == "lambert")
+            key = corner.sum(1) + sum(flag << k for k, flag in enumerate(flags))
             for numbers in look.contiguous().view(torch.int64).unbind(1):
                 key = _mix(key ^ numbers)
             if mesh.material.texture is not None:

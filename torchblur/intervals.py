@@ -22,6 +22,7 @@ from torchblur.prisms import Prisms
 
 FIXED = -1  # kind of an interval's end: end of the prism's slice of time
 NEAR, FAR = 3, 4  # 0, 1, 2 are the edges
+SHORTEST = 1e-13  # of the window: faces that are lines cover rays for so long, by rounding; a pixel misses as much
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class Intervals:
 
     offsets: Tensor  # (pixels + 1,) int64
     prism: Tensor  # (N,) int64
-    t_start: Tensor  # (N,) float64 shutter time, t_start < t_end
+    t_start: Tensor  # (N,) float64 shutter time, before t_end by more than SHORTEST
     t_end: Tensor  # (N,) float64
     near_num: Tensor  # (4, N) float64 Bernstein coefficients of M over the interval; no gradient
     near_den: Tensor  # (4, N) float64 of D
@@ -95,7 +96,7 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
         pair, u_start, u_end, kind_start, kind_end = (torch.cat(p) for p in zip(*found, strict=True))
         t_start, t_end = (_to_shutter_time(prisms, prism[pair], u) for u in (u_start, u_end))
         order = torch.sort(pixel[pair], stable=True).indices
-        order = order[(t_start < t_end)[order]]
+        order = order[(t_end - t_start > SHORTEST * (prisms.window[1] - prisms.window[0]))[order]]
         pair, u_start, u_end, kind_start, kind_end, t_start, t_end = (
             a[order] for a in (pair, u_start, u_end, kind_start, kind_end, t_start, t_end)
         )

@@ -50,7 +50,9 @@ class Accuracy:
     def exact(cls, transmittance_cutoff: float = 0.0) -> Accuracy:
         """Return the accuracy that follows depth, place on the texture and shading through time as they are.
 
-        Accuracy: a pixel is wrong by at most 1e-6 of the largest radiance in it, the cut-off aside.
+        Accuracy: a pixel is wrong by at most 1e-6 of the largest radiance in it (a texture's contrast, the light on a
+            facing surface), the cut-off aside. Not certified are the last 2^-16 of an interval next to a time at which
+            a face is seen edge-on, or a light or a vanishing normal is met.
         """
         return cls(transmittance_cutoff)
 
@@ -61,6 +63,9 @@ class Accuracy:
         Over each interval z / w, the texture coordinates and the position run straight in time between their values
         at the ends; the normal is that of the start. Straight in z / w is wrong even for a surface that moves evenly
         along the ray, whose w is straight: from w = 1 to 9 it passes w = 3 at t = 1/4, by its chord at t = 3/4.
+
+        Cells are cut where the shutter bends; between, its weight counts as even. A texture's footprint is that at the
+        interval's start.
 
         Accuracy: none stated: depth and texture may be wrong by their whole range within an interval.
         Source: Ronnow et al. 2021, sec. 4.

@@ -30,13 +30,19 @@ class Atlas:
 def build_atlas(meshes: tuple[Mesh, ...], device: torch.device) -> Atlas:
     """Return the textures of all meshes, opacity 1 added where a texture has none. Source: Williams 1983."""
     white = torch.ones(1, 1, 4, dtype=torch.float64, device=device)
-    pyramids = []
+    levels_of: dict[tuple[int, bool], int] = {}  # by texture and mip maps: meshes may share them
+    pyramids: list[list[Tensor]] = []
+    which = []
     for mesh in meshes:
-        texture = mesh.material.texture
-        image = white if texture is None else texture.to(device, torch.float64)
-        opacity = torch.ones(*image.shape[:2], 4 - image.shape[2], dtype=torch.float64, device=device)
-        image = torch.cat([image, opacity], dim=2)
-        pyramids.append(pyramid(image) if mesh.material.mipmap else [image])
+        texture, mipmap = mesh.material.texture, mesh.material.mipmap
+        key = (id(texture), mipmap)
+        if key not in levels_of:
+            image = white if texture is None else texture.to(device, torch.float64)
+            opacity = torch.ones(*image.shape[:2], 4 - image.shape[2], dtype=torch.float64, device=device)
+            image = torch.cat([image, opacity], dim=2)
+            levels_of[key] = len(pyramids)
+            pyramids.append(pyramid(image) if mipmap else [image])
+        which.append(levels_of[key])
     most = max((len(p) for p in pyramids), default=1)
     firsts = iter(itertools.accumulate((i.shape[0] * i.shape[1] for p in pyramids for i in p), initial=0))
     first, size = [], []
@@ -46,11 +52,13 @@ def build_atlas(meshes: tuple[Mesh, ...], device: torch.device) -> Atlas:
         first.append(places + places[-1:] * (most - len(levels)))
         size.append(sizes + sizes[-1:] * (most - len(levels)))
     images = [i.reshape(-1, 4) for p in pyramids for i in p]
+    one = torch.tensor(which, dtype=torch.int64, device=device)
+    counts = torch.tensor([len(p) for p in pyramids], dtype=torch.int64, device=device)
     return Atlas(
         texels=torch.cat(images) if images else white.reshape(1, 4),
-        first=torch.tensor(first, dtype=torch.int64, device=device).reshape(-1, most).T,
-        size=torch.tensor(size, dtype=torch.int64, device=device).reshape(-1, most, 2).permute(1, 2, 0),
-        n_levels=torch.tensor([len(p) for p in pyramids], dtype=torch.int64, device=device),
+        first=torch.tensor(first, dtype=torch.int64, device=device).reshape(-1, most).T[:, one],
+        size=torch.tensor(size, dtype=torch.int64, device=device).reshape(-1, most, 2).permute(1, 2, 0)[..., one],
+        n_levels=counts[one],
         repeats=torch.tensor([m.material.wrap == "repeat" for m in meshes], dtype=torch.bool, device=device),
     )
 

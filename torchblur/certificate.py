@@ -16,6 +16,7 @@ Source: Trefethen 2013, Approximation Theory and Approximation Practice; its use
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 
@@ -40,7 +41,8 @@ class Divider:
 
     span: Tensor  # (m,) int64, sorted
     q: Tensor  # (d + 1, c, m) float64 Bernstein coefficients over the span
-    limit: float  # share of |c_0| by which they may vary
+    limit: float | Callable[[Tensor, Tensor], Tensor]  # share of |c_0| by which they may vary; or of which of the m, at
+    # what time in the span, for all of a panel
 
 
 @dataclass(frozen=True)
@@ -71,7 +73,8 @@ def nodes_needed(
     for divider in dividers:
         index, of = _on_panels(divider.span, panels, n_spans)
         q = _chebyshev(bernstein.restrict(divider.q[..., index], start[of], end[of])).norm(dim=1)
-        sized.append((of, _significant(q, q[0]), divider.limit))
+        limit = divider.limit(index, 0.5 * (start + end)[of]) if callable(divider.limit) else divider.limit
+        sized.append((of, _significant(q, q[0]), limit))
     index, of = _on_panels(lookup.span, panels, n_spans)
     scale, place = (
         _chebyshev(bernstein.restrict(c[..., index], start[of], end[of])) for c in (lookup.scale, lookup.place)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein
-from torchblur.certificate import VECTOR_LIMIT
+from torchblur.certificate import VECTOR_LIMIT, Divider
 from torchblur.lights import SpotLight
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
@@ -65,22 +65,40 @@ class LightPaths:
                     taus.append(tau)
         return torch.cat(paths), torch.cat(taus)
 
-    def smooth_vectors(self, prisms: Prisms) -> list[tuple[Tensor, Tensor, float]]:
-        """Return the paths (n,), coefficients (d + 1, c, n) and the share of its mean that each vector may vary by for
-        the light to be smooth.
+    def dividers(self, prisms: Prisms) -> list[Divider]:
+        """Return what the light on the paths divides by. Within the border of a cone vectors may vary by less, as the
+        light falls off in it; beyond, not at all does it matter how.
         """
-        every = torch.arange(len(self.paths.span), device=self.paths.span.device)
-        found = [(which, normal, VECTOR_LIMIT) for which, normal in self.normals]
+        spans = self.paths.span
+        found = [Divider(spans[which], normal, VECTOR_LIMIT) for which, normal in self.normals]
         for light, vector in zip(prisms.surfaces.lights, self.vectors, strict=True):
-            limit = VECTOR_LIMIT
-            if isinstance(light, SpotLight):
-                inner, outer = light.cosines
-                axis = torch.stack([light.axis_at(t) for t in self.paths.t])
-                border = LINEAR * (inner - outer) if inner > outer else 1.0
-                limit = min(limit, border)
-                found.append((every, axis, limit))
-            found.append((every, vector, limit))
+            if not isinstance(light, SpotLight):
+                found.append(Divider(spans, vector, VECTOR_LIMIT))
+                continue
+            axis = torch.stack([light.axis_at(t) for t in self.paths.t]).detach()
+
+            def limit(which: Tensor, tau: Tensor, at=(light, vector, axis)) -> Tensor:
+                return _cone_limit(*at, which, tau)
+
+            found += [Divider(spans, axis, limit), Divider(spans, vector, limit)]
         return found
+
+
+def _cone_limit(light: SpotLight, vector: Tensor, axis: Tensor, which: Tensor, tau: Tensor) -> Tensor:
+    """Return by what share (n,) vectors to a spot may vary about the times `tau` of the paths `which` (n,)."""
+    v, a = (_value(c[..., which], tau) for c in (vector, axis))
+    size = v.norm(dim=0) * a.norm(dim=0)
+    cosine = (v * a).sum(0).abs() / torch.where(size > 0, size, 1.0)  # V may have the sign of -S
+    inner, outer = light.cosines
+    limit = torch.full_like(cosine, VECTOR_LIMIT)
+    limit[cosine < outer] = torch.inf
+    limit[(cosine >= outer) & (cosine < inner)] = min(VECTOR_LIMIT, LINEAR * (inner - outer))
+    return limit
+
+
+def _value(c: Tensor, tau: Tensor) -> Tensor:
+    """Return (3, n) values of vectors of polynomials (d + 1, 3, n) at `tau` (n,)."""
+    return torch.stack([bernstein.value(row, tau) for row in c.unbind(1)])
 
 
 def _flat_normals(world: Tensor) -> Tensor:

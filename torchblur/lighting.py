@@ -12,6 +12,7 @@ import math
 import torch
 from torch import Tensor
 
+from torchblur.lights import unit
 from torchblur.surfaces import Surfaces
 
 
@@ -35,8 +36,7 @@ def reflected(surfaces: Surfaces, point: Tensor, normal: Tensor, t: Tensor) -> T
     Gradient: to points, normals and lights.
     Source: Lambert's law.
     """
-    square = normal.square().sum(0)
-    normal = normal / torch.where(square > 0, square, 1.0).sqrt()
+    normal = unit(normal)
     total = surfaces.ambient.expand(point.shape[1], 3)
     for light in surfaces.lights:
         to_light, irradiance = light.arriving(point, t)

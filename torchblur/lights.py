@@ -19,6 +19,8 @@ from torch import Tensor
 from torchblur import bernstein, check
 from torchblur.camera import lerp_knots
 
+LEAST_ANGLE_DEG = 0.01  # of a spot: below, cosines lose the angle
+
 
 @dataclass(frozen=True, eq=False)
 class PointLight:
@@ -77,9 +79,9 @@ class SpotLight:
     Args:
         position, target: (3,) or (K+1, 3) floats [scene units]; the axis runs from one to the other.
         intensity: a number or (3,) linear RGB, at least 0, along the axis [W/sr].
-        inner_angle_deg, outer_angle_deg: from the axis [degrees], 0 <= inner <= outer, 0 < outer <= 90; between them
-            the light falls by the square of a linear function of the angle's cosine; equal angles are a hard border,
-            through which no gradient passes.
+        inner_angle_deg, outer_angle_deg: from the axis [degrees], 0 <= inner <= outer, 0.01 <= outer <= 90; between
+            them the light falls by the square of a linear function of the angle's cosine; equal angles are a hard
+            border, through which no gradient passes.
 
     Raises:
         TypeError, ValueError: a wrong argument, named; a target at the position.
@@ -95,7 +97,7 @@ class SpotLight:
         object.__setattr__(self, "position", _moving("position", self.position))
         object.__setattr__(self, "target", _moving("target", self.target))
         object.__setattr__(self, "intensity", _rgb("intensity", self.intensity))
-        check.number("outer_angle_deg", self.outer_angle_deg, 1e-6, 90.0)
+        check.number("outer_angle_deg", self.outer_angle_deg, LEAST_ANGLE_DEG, 90.0)
         check.number("inner_angle_deg", self.inner_angle_deg, 0.0, self.outer_angle_deg)
         times = torch.tensor([0.0, *self.knots, 1.0], dtype=torch.float64, device=self.position.device)
         if (self.axis_at(times).detach().norm(dim=0) == 0).any():
@@ -123,7 +125,7 @@ class SpotLight:
         """Return what `PointLight.arriving` does, within the cone. Source: glTF, KHR_lights_punctual."""
         to_light, irradiance = _from_a_point(along(self.position, t) - point, self.intensity)
         axis = self.axis_at(t)
-        cosine = -(axis * to_light).sum(0) / axis.norm(dim=0)
+        cosine = -(unit(axis) * to_light).sum(0)
         inner, outer = self.cosines
         if inner > outer:
             share = ((cosine - outer) / (inner - outer)).clamp(0, 1).square()
@@ -154,8 +156,8 @@ class DirectionalLight:
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", _moving("direction", self.direction))
         object.__setattr__(self, "irradiance", _rgb("irradiance", self.irradiance))
-        if (self.direction.detach().norm(dim=-1) == 0).any():
-            raise check.fail("direction", "a vector that is not 0", self.direction.detach())
+        if (self.direction.detach() == 0).all(-1).any():
+            raise check.fail("direction", "a vector that is not 0", "a vector of zeros")
 
     @property
     def knots(self) -> list[float]:
@@ -168,9 +170,9 @@ class DirectionalLight:
 
     def arriving(self, point: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
         """Return what `PointLight.arriving` does."""
-        back = -along(self.direction, t)
+        back = -along(self.direction, t)  # between opposite knots it passes through 0, and lights nothing
         irradiance = self.irradiance.to(back.device, torch.float64).expand(point.shape[1], 3)
-        return back / back.norm(dim=0), irradiance
+        return unit(back), irradiance
 
     def path(self, place: Tensor, scale: Tensor, times: Tensor) -> Tensor:
         """Return (2, 3, K) Bernstein coefficients of the vector towards the light; see `PointLight.path`."""
@@ -185,6 +187,14 @@ def along(knots: Tensor, t: Tensor) -> Tensor:
     """Return (3, K) float64 values at the shutter times `t` (K,) of (3,) or (K+1, 3) knots."""
     knots = knots.to(t.device, torch.float64)
     return knots.unsqueeze(1).expand(3, len(t)) if knots.ndim == 1 else lerp_knots(knots, t).T
+
+
+def unit(vector: Tensor) -> Tensor:
+    """Return vectors (3, K) at length 1, or 0 where they are, however small or large they are. Source: ours."""
+    largest = vector.detach().abs().amax(0)
+    vector = vector / torch.where(largest > 0, largest, 1.0)
+    square = vector.square().sum(0)
+    return vector / torch.where(square > 0, square, 1.0).sqrt()
 
 
 def _from_a_point(vector: Tensor, intensity: Tensor) -> tuple[Tensor, Tensor]:

@@ -3,7 +3,7 @@
 Before: texture_bends.py, light_bends.py.  After: resolve.py.
 Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), spans (see paths.py), p panels
 (slices of a span in which no look bends). Panels get as many nodes as certificate.py asks for; those for which the most
-do not suffice are halved.
+do not suffice are halved, towards a time at which a divider vanishes at most MAX_HALVINGS times.
 Source: Gauss-Legendre quadrature; ours.
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from torchblur import packed
 from torchblur.cells import Cells
 from torchblur.certificate import SCALE_LIMIT, VECTOR_LIMIT, Divider, nodes_needed
 from torchblur.intervals import Intervals
@@ -24,14 +25,17 @@ from torchblur.paths import Paths, between, cut_spans, follow
 from torchblur.prisms import Prisms
 from torchblur.shading import needing_points
 from torchblur.sort import argsort_by
+from torchblur.surfaces import Surfaces
 from torchblur.texture_bends import TexturePaths
 
 COUNTS = (1, 2, 3, 4, 5, 6, 8, 10, 12, 16)  # nodes of a panel
 FEW, FEW_LIT = 3, 8  # nodes that panels of textured and of lit layers take on average, or fewer
 BYTES_PER_LOOK = 900  # of place_samples and composite_samples, a layer of a sample, with textures and lights
 BYTES_PER_LAYER = 400  # the same, with neither
+BYTES_TO_CUT = 260  # of cut_cells, a layer
+BYTES_PER_PATH, BYTES_PER_LIGHT = 2500, 1200  # of find_varying, a layer with texture or light, and each light on it
 MAX_HALVINGS = 16  # towards a time at which a q vanishes (a face seen edge-on); what is looked at stays finite there
-MANY, FREE_HALVINGS = 8, 4  # panels of a span that may fail after so many halvings; more are noise, and accepted
+MANY, FREE_HALVINGS = 64, 8  # panels of a span that may fail after so many halvings; more are rounding, and accepted
 
 
 @dataclass(frozen=True)
@@ -99,18 +103,35 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
 
 
 @torch.no_grad()
-def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> int:
-    """Return about how much memory the samples of the cells will take at their peak [bytes]. Source: ours."""
-    n_layers = cells.layer_offsets.diff()
-    total = int(n_layers.sum())
+def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> Tensor:
+    """Return about how much memory the samples of each pixel (pixels,) take at their peak [bytes]. Source: ours."""
+    n_layers = cells.layer_offsets.diff().to(torch.float64)
     surfaces = prisms.surfaces
     if varying is None:
-        return total * (BYTES_PER_LOOK if (surfaces.is_textured | surfaces.is_lit).any() else BYTES_PER_LAYER)
-    lines = varying.textured.count_lines(prisms)
-    panels = torch.ones_like(varying.start).index_add(0, varying.textured.paths.span, lines)
-    nodes = torch.full_like(panels, FEW)
-    nodes[varying.lit.paths.span] = FEW_LIT
-    return total * BYTES_PER_LAYER + int((panels * nodes * n_layers[varying.cell]).sum()) * BYTES_PER_LOOK
+        is_plain = not (surfaces.is_textured | surfaces.is_lit).any()
+        of_cell = n_layers * (BYTES_PER_LAYER if is_plain else BYTES_PER_LOOK)
+    else:
+        lines = varying.textured.count_lines(prisms)
+        panels = torch.ones_like(varying.start).index_add(0, varying.textured.paths.span, lines)
+        nodes = torch.full_like(panels, FEW)
+        nodes[varying.lit.paths.span] = FEW_LIT
+        of_cell = n_layers * BYTES_PER_LAYER
+        of_cell = of_cell.index_add(0, varying.cell, panels * nodes * n_layers[varying.cell] * BYTES_PER_LOOK)
+    return packed.sum_by_owner(of_cell, cells.offsets)
+
+
+def bytes_per_layer(surfaces: Surfaces, n_knots: int) -> int:
+    """Return about how much memory a layer takes at the peak of `cut_cells` and `find_varying` [bytes]: the paths of
+    one with texture or light, once for each slice of time between the `n_knots` knots of shutters and lights.
+
+    Source: ours.
+    """
+    paths = 0
+    if surfaces.is_textured.any():
+        paths += BYTES_PER_PATH
+    if surfaces.is_lit.any():
+        paths += BYTES_PER_PATH + BYTES_PER_LIGHT * len(surfaces.lights)
+    return BYTES_TO_CUT + paths * (n_knots + 1)
 
 
 @torch.no_grad()
@@ -181,7 +202,7 @@ def _dividers(prisms: Prisms, varying: Varying) -> list[Divider]:
     scaled = scaled.nonzero().flatten()
     found = [Divider(varying.paths.span[scaled], varying.paths.scale[:, scaled].unsqueeze(1), SCALE_LIMIT)]
     found.append(Divider(textured.paths.span[textured.mipped], textured.slope, VECTOR_LIMIT))
-    found += [Divider(lit.paths.span[which], q, limit) for which, q, limit in lit.smooth_vectors(prisms)]
+    found += lit.dividers(prisms)
     return [f for f in found if len(f.span)]
 
 

@@ -91,6 +91,30 @@ def cut_spans(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[T
     return Spans(cell[owner], start, end, ends)
 
 
+def cut_at_knots(cells: Cells, knots: tuple[Tensor, Tensor]) -> Cells:
+    """Return the cells cut where a shutter bends, with their layers; `knots` as in `cut_spans`. Source: ours."""
+    pixel = packed.owners(cells.offsets)
+    t_start, t_end = cells.t_start.detach(), cells.t_end.detach()
+    every = torch.arange(len(pixel), device=pixel.device)
+    owners, taus = [every, every], [torch.zeros_like(t_start), torch.ones_like(t_start)]
+    for time, delay in zip(*knots, strict=True):
+        tau = (time + delay[pixel] - t_start) / (t_end - t_start)
+        inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
+        owners.append(inside)
+        taus.append(tau[inside])
+    owner, start, end = between(torch.cat(owners), torch.cat(taus))
+    counts = cells.layer_offsets.diff()[owner]
+    layer, _ = packed.expand(cells.layer_offsets[owner], counts)
+    ends = ((1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner] for tau in (start, end))
+    return Cells(
+        packed.offsets_from_owners(pixel[owner], len(cells.offsets) - 1),
+        *ends,
+        packed.offsets_from_counts(counts),
+        cells.layer_interval[layer],
+        cells.n_crossings,
+    )
+
+
 def between(owner: Tensor, tau: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return the owner, start and end of the slices between the times `tau` (n,) of each `owner` (n,). Ours."""
     order = argsort_by(owner, tau)

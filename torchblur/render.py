@@ -19,17 +19,17 @@ from torchblur.accuracy import Accuracy
 from torchblur.camera import MAX_RAYS, Ray, pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
-from torchblur.nodes import estimate_bytes, find_varying, place_samples
+from torchblur.nodes import bytes_per_layer, estimate_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
+from torchblur.paths import cut_at_knots
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.subdivide import approximate
-from torchblur.surfaces import build_surfaces
+from torchblur.surfaces import Surfaces, build_surfaces
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
-BYTES_PER_LAYER = 260  # peak of cut_cells, a layer
 MIN_MEMORY_BYTES = 1 << 20
 COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "nodes", "deepest_pixel")
 STAGES = ("prisms", "intervals", "cells", "resolve")
@@ -83,8 +83,9 @@ def render(
         shutter: `Shutter.box()`, the whole exposure, if None.
         rays_per_pixel: 1 looks through the pixel's centre only; more rays, each exact in time, are spread inside the
             pixel and averaged (box filter).
-        memory_bytes: working memory to stay under, by dividing the image into blocks [bytes]. The image and the prisms
-            (0.4 kB a face and piece of motion) come on top, with gradients autograd keeps every block, and a single ray
+        memory_bytes: working memory to stay under, by dividing the image into blocks [bytes]. The image, the prisms
+            (0.4 kB a face and piece of motion, twice that where there is light) and the textures (43 bytes a texel
+            with mip levels) come on top, with gradients autograd keeps every block, and a single ray
             that needs more gets it.
 
     Returns:
@@ -215,7 +216,7 @@ class _Job:
             if intervals.count == 0:
                 continue
             self.ledger.deepest("deepest_pixel", intervals.offsets.diff().max())
-            for pixels in self._chunks(intervals):
+            for pixels in self._chunks(prisms.surfaces, intervals):
                 column, row = block.x0 + pixels % block.width, block.y0 + pixels // block.width
                 places.append(row * camera.width + column)
                 values.append(self._resolve(prisms, intervals.of_pixels(pixels), (column, row)))
@@ -225,21 +226,23 @@ class _Job:
             image = image.index_put((torch.cat(places),), torch.cat(values))
         return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
 
-    def _resolve(self, prisms: Prisms, intervals: Intervals, pixel: tuple[Tensor, Tensor]) -> Tensor:
-        """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`."""
+    def _resolve(
+        self, prisms: Prisms, intervals: Intervals, pixel: tuple[Tensor, Tensor], whole: bool = True
+    ) -> Tensor:
+        """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`, if `whole` in portions that fit."""
         camera, device = self.scene.camera, self.scene.device
         column, row = pixel
         is_exact = self.accuracy.method == "exact"
         lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("cells", device):
             cells = cut_cells(prisms, intervals)
+            cells = cells if is_exact else cut_at_knots(cells, self._knots(lines))
             varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
             n_bytes = estimate_bytes(prisms, cells, varying)
-        if n_bytes > self.memory_bytes and len(column) > 1:
-            half = len(column) // 2
+        if whole and float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
             parts = []
-            for chosen in torch.arange(len(column), device=device).split([half, len(column) - half]):
-                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), (column[chosen], row[chosen])))
+            for chosen in _portions(n_bytes, self.memory_bytes):
+                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), (column[chosen], row[chosen]), False))
             return torch.cat(parts)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
@@ -282,12 +285,20 @@ class _Job:
         for part in parts:
             yield from self._blocks(prisms, part, candidates)
 
-    def _chunks(self, intervals: Intervals) -> Iterator[Tensor]:
+    def _chunks(self, surfaces: Surfaces, intervals: Intervals) -> Iterator[Tensor]:
         """Yield runs of covered pixels whose layers fit the memory."""
         with self.ledger.stage("cells", self.scene.device):
             layers = count_layers(intervals)
             pixels = (layers > 0).nonzero().flatten()
-            per_chunk = max(1, self.memory_bytes // BYTES_PER_LAYER)
-            chunk = torch.cumsum(layers[pixels], 0) // per_chunk
-            sizes = torch.unique_consecutive(chunk, return_counts=True)[1].tolist()
-        yield from torch.split(pixels, sizes)
+            inner = {t for s in self.shutters for t in s.times} | {t for k in surfaces.lights for t in k.knots}
+            of_layer = bytes_per_layer(surfaces, len(inner - {0.0, 1.0}))
+        yield from (pixels[chosen] for chosen in _portions(layers[pixels].double() * of_layer, self.memory_bytes))
+
+
+def _portions(n_bytes: Tensor, memory_bytes: int) -> Sequence[Tensor]:
+    """Return runs of indices whose `n_bytes` (n,) add up to about `memory_bytes` or are single."""
+    if len(n_bytes) == 0:
+        return ()
+    portion = torch.cumsum(n_bytes, 0) // memory_bytes
+    sizes = torch.unique_consecutive(portion, return_counts=True)[1].tolist()
+    return torch.arange(len(n_bytes), device=n_bytes.device).split(sizes)

@@ -70,7 +70,8 @@ class Mesh:
         object.__setattr__(self, "faces", faces)
         object.__setattr__(self, "uv", uv)
         if self.normals is not None:
-            normals = check.floats("normals", self.normals, vertices.shape[-2:], vertices.shape)
+            shapes = {tuple(vertices.shape[-2:]), tuple(vertices.shape)}  # moving normals need moving vertices
+            normals = check.floats("normals", self.normals, *sorted(shapes, key=len))
             if (normals.detach() == 0).all(-1).any():
                 raise check.fail("normals", "vectors that are not 0", "a vector of zeros")
             object.__setattr__(self, "normals", normals)
@@ -115,7 +116,7 @@ class Scene:
     A face of shading "lambert" shows its colour times (ambient + sum of irradiance / pi * cosine) over the lights: with
     its own normal turned to the viewer, or with the mesh's vertex normals, negated where the eye sees the back of the
     face, from which its corners turn clockwise.
-    Lights cast no shadows.
+    Faces of shading "unlit" ignore lights and ambient. Lights cast no shadows.
 
     Args:
         meshes: any number of meshes, none too.
@@ -146,7 +147,8 @@ class Scene:
             raise check.fail("background", "values of at least 0", f"{float(background.detach().min())}")
         if not isinstance(self.lights, (list, tuple)) or not all(isinstance(light, LIGHTS) for light in self.lights):
             names = ", ".join(kind.__name__ for kind in LIGHTS)
-            raise check.fail_type("lights", f"a sequence of {names}", self.lights)
+            found = type(self.lights).__name__ if isinstance(self.lights, LIGHTS) else self.lights
+            raise check.fail_type("lights", f"a sequence of {names}", found)
         object.__setattr__(self, "lights", tuple(self.lights))
         ambient = check.floats("ambient", self.ambient, (3,))
         if (ambient.detach() < 0).any():

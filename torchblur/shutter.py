@@ -51,6 +51,8 @@ class Shutter:
         check.number("line_delay", self.line_delay, 0.0, 1.0)
         if self.direction not in DIRECTIONS:
             raise check.fail("direction", f"one of {', '.join(DIRECTIONS)}", self.direction)
+        if not math.isfinite(sum(weights)):
+            raise check.fail("weights", "numbers whose sum is finite", self.weights)
         object.__setattr__(self, "times", times)
         object.__setattr__(self, "weights", weights)
 

@@ -120,9 +120,14 @@ def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> Ten
     return packed.sum_by_owner(of_cell, cells.offsets)
 
 
-def bytes_per_layer(surfaces: Surfaces, n_knots: int) -> int:
-    """Return about how much memory a layer takes at the peak of `cut_cells` and `find_varying` [bytes]: the paths of
-    one with texture or light, once for each slice of time between the `n_knots` knots of shutters and lights.
+def estimate_path_bytes(surfaces: Surfaces, layers: Tensor, n_intervals: Tensor, n_knots: int) -> Tensor:
+    """Return about how much memory `cut_cells` and `find_varying` take at their peak, by pixel (pixels,) [bytes].
+
+    Args:
+        surfaces: what the faces look like: those with texture or light have paths, one for each slice of a cell.
+        layers: (pixels,) of all cells.
+        n_intervals: (pixels,) which make at most twice as many cells.
+        n_knots: of shutters and lights inside the exposure: each cuts one cell of a pixel more.
 
     Source: ours.
     """
@@ -131,7 +136,8 @@ def bytes_per_layer(surfaces: Surfaces, n_knots: int) -> int:
         paths += BYTES_PER_PATH
     if surfaces.is_lit.any():
         paths += BYTES_PER_PATH + BYTES_PER_LIGHT * len(surfaces.lights)
-    return BYTES_TO_CUT + paths * (n_knots + 1)
+    depth = layers / (2 * n_intervals - 1).clamp(min=1)
+    return layers * float(BYTES_TO_CUT + paths) + depth * float(n_knots * paths)
 
 
 @torch.no_grad()

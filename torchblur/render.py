@@ -19,7 +19,7 @@ from torchblur.accuracy import Accuracy
 from torchblur.camera import MAX_RAYS, Ray, pixel_rays
 from torchblur.cells import count_layers, cut_cells
 from torchblur.intervals import Intervals, find_intervals
-from torchblur.nodes import bytes_per_layer, estimate_bytes, find_varying, place_samples
+from torchblur.nodes import estimate_bytes, estimate_path_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.paths import cut_at_knots
 from torchblur.prisms import Prisms, build_prisms
@@ -291,8 +291,9 @@ class _Job:
             layers = count_layers(intervals)
             pixels = (layers > 0).nonzero().flatten()
             inner = {t for s in self.shutters for t in s.times} | {t for k in surfaces.lights for t in k.knots}
-            of_layer = bytes_per_layer(surfaces, len(inner - {0.0, 1.0}))
-        yield from (pixels[chosen] for chosen in _portions(layers[pixels].double() * of_layer, self.memory_bytes))
+            n_intervals = intervals.offsets.diff()[pixels]
+            n_bytes = estimate_path_bytes(surfaces, layers[pixels], n_intervals, len(inner - {0.0, 1.0}))
+        yield from (pixels[chosen] for chosen in _portions(n_bytes, self.memory_bytes))
 
 
 def _portions(n_bytes: Tensor, memory_bytes: int) -> Sequence[Tensor]:

@@ -201,7 +201,7 @@ def linear_pixel(scene: LookScene, shutter: PlainShutter, row: int, col: int, pl
     delay = shutter.delay(scene, row, col)
     pieces = pieces_between(scene, row, col, shutter.span(scene), place)
     stays = [Stay(p, p.t_start, p.t_end, _end_depths(p)) for p in pieces if scene.meshes[p.mesh].face_alpha(p.face) > 0]
-    cuts = {t for p in stays for t in (p.t_start, p.t_end)}
+    cuts = {t for p in stays for t in (p.t_start, p.t_end)} | {t + delay for t in shutter.times}
     for p, q in itertools.combinations(stays, 2):
         low, high = max(p.t_start, q.t_start), min(p.t_end, q.t_end)
         before, after = p.depth(low) - q.depth(low), p.depth(high) - q.depth(high)

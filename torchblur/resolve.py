@@ -23,8 +23,6 @@ from torchblur.prisms import Prisms
 from torchblur.shading import look, needing_points, points_on_prisms
 from torchblur.shutter import Shutter
 
-HIDDEN = 1e-12  # transmittance in front of a mesh that counts as none: rounding of opacities that textures interpolate
-
 
 @dataclass(frozen=True)
 class Composite:
@@ -74,7 +72,7 @@ def composite_samples(
     before, after = packed.transmittance(alpha, offsets, accuracy.transmittance_cutoff)
     light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
     n_meshes = max(1, len(surfaces.first_face))
-    visible = ((before.detach() > HIDDEN) & (alpha.detach() > 0)).nonzero().flatten()
+    visible = ((before.detach() > 0) & (alpha.detach() > 0)).nonzero().flatten()
     seen = torch.unique(sample[visible] * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once
     return Composite(torch.cat([light, (1 - after).unsqueeze(1)], dim=1), seen // n_meshes, seen % n_meshes)
 

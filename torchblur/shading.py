@@ -19,6 +19,8 @@ from torchblur.prisms import Prisms
 from torchblur.surfaces import Surfaces
 from torchblur.texture import lookup, mip_level
 
+OPAQUE = 1e-14  # rounding of an interpolated opacity of 1
+
 
 @dataclass(frozen=True)
 class Points:
@@ -64,7 +66,9 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tup
             level = mip_level(surfaces, own, uv_slopes(points, textured))
         rgba = lookup(surfaces, own, (points.weight[:, textured] * corner_uv).sum(1), level)
         rgb = rgb.index_put((of,), rgb[of] * rgba[:, :3])
-        alpha = alpha.index_put((of,), alpha[of] * rgba[:, 3])
+        opacity = rgba[:, 3]  # 1 must stay 1 for what is behind to be hidden, but weights add up to 1 - 1e-16
+        opacity = opacity + ((1 - opacity) * (opacity > 1 - OPAQUE)).detach()
+        alpha = alpha.index_put((of,), alpha[of] * opacity)
     lit = surfaces.is_lit[points.face].nonzero().flatten()
     if len(lit):
         light = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit])

@@ -77,6 +77,15 @@ def restrict(coefficients: Tensor, u_start: Tensor, u_end: Tensor) -> Tensor:
     return torch.stack(out)
 
 
+def ratio_range(numerator: Tensor, denominator: Tensor) -> tuple[Tensor, Tensor]:
+    """Return bounds (K,) of the quotient of polynomials of one degree (d + 1, K): a rational Bezier lies in the hull of
+    its ratios. Infinities where the denominator may vanish.
+    """
+    is_proper = (denominator > 0).all(0) | (denominator < 0).all(0)
+    ratio = numerator / torch.where(is_proper, denominator, 1.0)
+    return torch.where(is_proper, ratio.amin(0), -torch.inf), torch.where(is_proper, ratio.amax(0), torch.inf)
+
+
 def sign_changes(coefficients: Tensor, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return how often the sign changes along the coefficients, and the first and the last sign, all (n,) int64.
 

@@ -196,7 +196,7 @@ def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Cr
     lower = (has_upper & (length > least)).nonzero().flatten()
     upper = torch.minimum(lower - 1, layers.last_seen[lower])
     pair = torch.stack([layers.interval[upper], layers.interval[lower]])
-    low, high = _nearness_range(intervals)
+    low, high = bernstein.ratio_range(intervals.near_num, intervals.near_den)
     suspect = (low[pair[0]] <= high[pair[1]]).nonzero().flatten()
     pair, cell = pair[:, suspect], layers.cell[lower[suspect]]
     start, end = layers.instant_t[cell], layers.instant_t[cell + 1]
@@ -214,14 +214,6 @@ def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Cr
     inner = ((t - start[which] > least) & (end[which] - t > least)).nonzero().flatten()
     which = which[inner]
     return Crossings(layers.instant_pixel[cell[which]], t[inner], pair[:, which])
-
-
-def _nearness_range(intervals: Intervals) -> tuple[Tensor, Tensor]:
-    """Return bounds (N,) of nearness over each interval: a rational Bezier lies in the hull of its ratios."""
-    num, den = intervals.near_num, intervals.near_den
-    proper = (den > 0).all(0) | (den < 0).all(0)
-    ratio = num / torch.where(proper, den, 1.0)
-    return torch.where(proper, ratio.amin(0), -torch.inf), torch.where(proper, ratio.amax(0), torch.inf)
 
 
 def _of_pixels(crossings: Crossings, pixels: Tensor) -> Crossings:

@@ -75,7 +75,7 @@ class LightPaths:
             if not isinstance(light, SpotLight):
                 found.append(Divider(spans, vector, VECTOR_LIMIT))
                 continue
-            axis = torch.stack([light.axis_at(t) for t in self.paths.t]).detach()
+            axis = _axis(light, self.paths.t)
 
             def limit(which: Tensor, tau: Tensor, at=(light, vector, axis)) -> Tensor:
                 return _cone_limit(*at, which, tau)
@@ -86,7 +86,7 @@ class LightPaths:
 
 def _cone_limit(light: SpotLight, vector: Tensor, axis: Tensor, which: Tensor, tau: Tensor) -> Tensor:
     """Return by what share (n,) vectors to a spot may vary about the times `tau` of the paths `which` (n,)."""
-    v, a = (_value(c[..., which], tau) for c in (vector, axis))
+    v, a = (bernstein.value(c[..., which], tau) for c in (vector, axis))
     size = v.norm(dim=0) * a.norm(dim=0)
     cosine = (v * a).sum(0).abs() / torch.where(size > 0, size, 1.0)  # V may have the sign of -S
     inner, outer = light.cosines
@@ -96,11 +96,6 @@ def _cone_limit(light: SpotLight, vector: Tensor, axis: Tensor, which: Tensor, t
     return limit
 
 
-def _value(c: Tensor, tau: Tensor) -> Tensor:
-    """Return (3, n) values of vectors of polynomials (d + 1, 3, n) at `tau` (n,)."""
-    return torch.stack([bernstein.value(row, tau) for row in c.unbind(1)])
-
-
 def _flat_normals(world: Tensor) -> Tensor:
     """Return (3, 3, K) coefficients of the normals of corners (2 ends, 3 corners, 3, K) that move linearly."""
     a, b = world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]
@@ -108,9 +103,14 @@ def _flat_normals(world: Tensor) -> Tensor:
     return torch.stack([torch.linalg.cross(a[0], b[0], dim=0), 0.5 * mixed, torch.linalg.cross(a[1], b[1], dim=0)])
 
 
+def _axis(light: SpotLight, times: Tensor) -> Tensor:
+    """Return (2, 3, K) coefficients of a spot's axis between the shutter times (2, K)."""
+    return torch.stack([light.axis_at(t) for t in times]).detach()
+
+
 def _cone_roots(light: SpotLight, vector: Tensor, times: Tensor) -> list[tuple[Tensor, Tensor]]:
     """Return the paths and times at which `vector` (4, 3, K) lies on the borders of the cone."""
-    axis = torch.stack([light.axis_at(t) for t in times]).detach()
+    axis = _axis(light, times)
     half = bernstein.product(vector, axis).sum(1)
     along = bernstein.product(half, half)
     square = bernstein.product(bernstein.product(vector, vector).sum(1), bernstein.product(axis, axis).sum(1))

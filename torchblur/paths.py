@@ -77,16 +77,9 @@ def cut_spans(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[T
     pixel = packed.owners(cells.offsets)[cell]
     times, delays = knots
     still = torch.tensor(sorted({t for light in prisms.surfaces.lights for t in light.knots}), dtype=torch.float64)
-    t_start, t_end = cells.t_start[cell], cells.t_end[cell]
-    place = torch.arange(len(cell), device=cell.device)
-    owners, taus = [place, place], [torch.zeros_like(t_start), torch.ones_like(t_start)]
     rows = [time + delay[pixel] for time, delay in zip(times, delays, strict=True)]
-    for at in [*rows, *still.to(t_start.device)]:
-        tau = (at - t_start) / (t_end - t_start)
-        inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
-        owners.append(inside)
-        taus.append(tau[inside])
-    owner, start, end = between(torch.cat(owners), torch.cat(taus))
+    owner, start, end = _slices(cells, cell, [*rows, *still.to(cell.device)])
+    t_start, t_end = cells.t_start[cell], cells.t_end[cell]
     ends = torch.stack([(1 - tau) * t_start[owner] + tau * t_end[owner] for tau in (start, end)])
     return Spans(cell[owner], start, end, ends)
 
@@ -94,15 +87,8 @@ def cut_spans(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[T
 def cut_at_knots(cells: Cells, knots: tuple[Tensor, Tensor]) -> Cells:
     """Return the cells cut where a shutter bends, with their layers; `knots` as in `cut_spans`. Source: ours."""
     pixel = packed.owners(cells.offsets)
-    t_start, t_end = cells.t_start.detach(), cells.t_end.detach()
     every = torch.arange(len(pixel), device=pixel.device)
-    owners, taus = [every, every], [torch.zeros_like(t_start), torch.ones_like(t_start)]
-    for time, delay in zip(*knots, strict=True):
-        tau = (time + delay[pixel] - t_start) / (t_end - t_start)
-        inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
-        owners.append(inside)
-        taus.append(tau[inside])
-    owner, start, end = between(torch.cat(owners), torch.cat(taus))
+    owner, start, end = _slices(cells, every, [time + delay[pixel] for time, delay in zip(*knots, strict=True)])
     counts = cells.layer_offsets.diff()[owner]
     layer, _ = packed.expand(cells.layer_offsets[owner], counts)
     ends = ((1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner] for tau in (start, end))
@@ -113,6 +99,21 @@ def cut_at_knots(cells: Cells, knots: tuple[Tensor, Tensor]) -> Cells:
         cells.layer_interval[layer],
         cells.n_crossings,
     )
+
+
+def _slices(cells: Cells, cell: Tensor, times: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the place in `cell` (C,), start and end, as shares of it, of the slices of cells between shutter `times`,
+    each for all or (C,).
+    """
+    t_start, t_end = cells.t_start[cell].detach(), cells.t_end[cell].detach()
+    every = torch.arange(len(cell), device=cell.device)
+    owners, taus = [every, every], [torch.zeros_like(t_start), torch.ones_like(t_start)]
+    for time in times:
+        tau = (time - t_start) / (t_end - t_start)
+        inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
+        owners.append(inside)
+        taus.append(tau[inside])
+    return between(torch.cat(owners), torch.cat(taus))
 
 
 def between(owner: Tensor, tau: Tensor) -> tuple[Tensor, Tensor, Tensor]:

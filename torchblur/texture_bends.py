@@ -63,7 +63,7 @@ class TexturePaths:
                 repeats = surfaces.atlas.repeats[mesh]
                 low = torch.where(repeats, low, low.clamp(min=0))
                 high = torch.where(repeats, high, torch.minimum(high, size[axis] - 1))
-                ratio_low, ratio_high = ratio_range(place, scale)
+                ratio_low, ratio_high = bernstein.ratio_range(place, scale)
                 low, high = torch.maximum(low, ratio_low).ceil(), torch.minimum(high, ratio_high).floor()
                 found.append((which, place, low, high))
         return found
@@ -110,15 +110,6 @@ class TexturePaths:
         return _square_of(self.slope), _fourth_power(self.paths.scale[:, self.mipped])
 
 
-def ratio_range(numerator: Tensor, denominator: Tensor) -> tuple[Tensor, Tensor]:
-    """Return bounds (K,) of a quotient of polynomials: that of their coefficients where the denominator has one sign,
-    else infinities.
-    """
-    is_proper = (denominator > 0).all(0) | (denominator < 0).all(0)
-    ratio = numerator / torch.where(is_proper, denominator, 1.0)
-    return torch.where(is_proper, ratio.amin(0), -torch.inf), torch.where(is_proper, ratio.amax(0), torch.inf)
-
-
 def _footprints(paths: Paths, uv: Tensor, size: Tensor) -> Tensor:
     """Return (5, 4, K) coefficients of S^2 d(texel) / d(ray), the entries of two axes by two."""
     x, y, w = paths.corners.x, paths.corners.y, paths.corners.w
@@ -145,7 +136,7 @@ def _fourth_power(scale: Tensor) -> Tensor:
 
 def _level_range(slope: Tensor, scale: Tensor, last: Tensor) -> Tensor:
     """Return the least and greatest level (2, K), whole numbers, of footprints."""
-    low, high = ratio_range(_square_of(slope), _fourth_power(scale))
+    low, high = bernstein.ratio_range(_square_of(slope), _fourth_power(scale))
     low, high = (0.5 * torch.log2(b.clamp(min=1.0)) for b in (low, high))
     return torch.minimum(torch.stack([low.floor(), high.ceil()]), last)
 

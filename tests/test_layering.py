@@ -29,13 +29,15 @@ TORCHBLUR = [
     "scene",
     "atlas",
     "surfaces",
-    "effects",
     "prisms",
+    "survey",
+    "effects",
     "edges",
     "pairs",
     "intervals",
-    "subdivide",
     "sort",
+    "hidden",
+    "subdivide",
     "cells",
     "texture",
     "lighting",
@@ -71,7 +73,11 @@ DOORS = {  # third-party package: the only files that may import it (stems; "*" 
 }
 MAX_LINES = 350
 MAX_PARAMETERS = 6
-MORE_PARAMETERS = {"look_at": "the field's own signature for a camera", "orthographic": "the twin of look_at"}
+MORE_PARAMETERS = {
+    "look_at": "the field's own signature for a camera",
+    "orthographic": "the twin of look_at",
+    "render_windows": "as render, and the windows",
+}
 BANNED_FILES = {"utils", "helpers", "common", "misc", "core", "manager", "data", "info"}
 BANNED_TEXT = [r"\bissue\b", r"/work\b", r"\bbrief\b", r"\bTODO\b", r"\bFIXME\b", r"\bagent\b", r"/home/", r"/tmp/"]
 

@@ -2,6 +2,7 @@
 
 from torchblur.accuracy import Accuracy
 from torchblur.camera import Camera
+from torchblur.effects import Effect, EffectPlan, plan_effects
 from torchblur.instant import Instant, motion_to, render_instant
 from torchblur.lights import DirectionalLight, PointLight, SpotLight
 from torchblur.material import Material
@@ -17,6 +18,8 @@ __all__ = [
     "Accuracy",
     "Camera",
     "DirectionalLight",
+    "Effect",
+    "EffectPlan",
     "Frame",
     "Instant",
     "Material",
@@ -29,6 +32,7 @@ __all__ = [
     "flip_hdr",
     "flip_ldr",
     "motion_to",
+    "plan_effects",
     "psnr",
     "render",
     "render_instant",

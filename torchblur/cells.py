@@ -64,12 +64,13 @@ def count_layers(intervals: Intervals) -> Tensor:
     return total[intervals.offsets].diff()
 
 
-def cut_cells(prisms: Prisms, intervals: Intervals) -> Cells:
+def cut_cells(prisms: Prisms, intervals: Intervals, may_cross: bool = True) -> Cells:
     """Return the cells of every pixel, each with its layers in depth order.
 
     Args:
         prisms: of the scene.
         intervals: of some pixels.
+        may_cross: whether surfaces may change places in depth; otherwise crossings are not looked for.
 
     Returns:
         Cells that cover exactly the times at which something covers the ray.
@@ -79,6 +80,8 @@ def cut_cells(prisms: Prisms, intervals: Intervals) -> Cells:
     Source: Ronnow et al. 2021, sec. 4.3.
     """
     layers = _stack_layers(prisms, intervals, None)
+    if not may_cross:
+        return _pack(intervals, layers, 0)
     crossings = found = _find_crossings(prisms, intervals, layers)
     if len(crossings.pixel) == 0:
         return _pack(intervals, layers, 0)

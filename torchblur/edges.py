@@ -157,6 +157,19 @@ def edge_signs(corners: Corners, roots: Tensor) -> Tensor:
     return torch.stack(signs)
 
 
+def still_sign(corners: Corners) -> Tensor:
+    """Return the common sign of the e_i (m,) int8 of corners at rest: +1 or -1 inside, 0 outside.
+
+    Bit for bit what `edge_signs` and `inside_sign` say of them. Source: as `edge_signs`.
+    """
+    x, y, w = corners.x[0], corners.y[0], corners.w[0]
+    e = edges_of(x, y)
+    if (e == 0).any():
+        a, b = (tuple(c[list(k)] for c in (x, y, w)) for k in (FIRST, SECOND))
+        e = _break_ties(e, a, b)
+    return (e > 0).all(0).to(torch.int8) - (e < 0).all(0).to(torch.int8)
+
+
 def _break_ties(e: Tensor, a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> Tensor:
     """Return `e` (3, m) with each zero replaced by the first of its slopes along the ray's x and y that is not; `a` and
     `b` are x, y, w (3, m) of the edges' corners.

@@ -80,7 +80,15 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
     """
     with torch.no_grad():
         prism, pixel = find_pairs(prisms, block, candidates)
-        n_pairs = len(prism)
+    return solve_pairs(prisms, block, prism, pixel), len(prism)
+
+
+def solve_pairs(prisms: Prisms, block: Block, prism: Tensor, pixel: Tensor) -> Intervals:
+    """Return the intervals of pairs of a prism (n,) and a pixel (n,) of `block`, which come prism by prism.
+
+    Source: as `find_intervals`.
+    """
+    with torch.no_grad():
         corners = edges.reduce_corners(prisms.clip, prism, block.ray_ndc(pixel))
         keep = _may_cover(prisms, prism, corners).nonzero().flatten()
         prism, pixel, corners = prism[keep], pixel[keep], corners[keep]
@@ -119,7 +127,26 @@ def find_intervals(prisms: Prisms, block: Block, candidates: Tensor) -> tuple[In
         near_den=near_den,
         ray_ndc=block.ray_ndc(all_pixels),
         spacing_ndc=block.spacing_ndc,
-    ), n_pairs
+    )
+
+
+def join_intervals(prisms: Prisms, parts: list[Intervals]) -> Intervals:
+    """Return the intervals of all `parts`, of the same pixels and of different prisms. Source: ours."""
+    if len(parts) == 1:
+        return parts[0]
+    pixel = torch.cat([packed.owners(part.offsets) for part in parts])
+    prism = torch.cat([part.prism for part in parts])
+    order = torch.sort(pixel * max(prisms.count, 1) + prism, stable=True).indices
+    return Intervals(
+        offsets=sum(part.offsets for part in parts),
+        prism=prism[order],
+        t_start=torch.cat([part.t_start for part in parts])[order],
+        t_end=torch.cat([part.t_end for part in parts])[order],
+        near_num=torch.cat([part.near_num for part in parts], dim=1)[:, order],
+        near_den=torch.cat([part.near_den for part in parts], dim=1)[:, order],
+        ray_ndc=parts[0].ray_ndc,
+        spacing_ndc=parts[0].spacing_ndc,
+    )
 
 
 def nearness_coefficients(prisms: Prisms, prism: Tensor, corners: Corners, u: Tensor) -> tuple[Tensor, Tensor]:

@@ -23,7 +23,6 @@ from torchblur.intervals import Intervals
 from torchblur.light_bends import LightPaths
 from torchblur.paths import Paths, between, cut_spans, follow
 from torchblur.prisms import Prisms
-from torchblur.shading import needing_points
 from torchblur.sort import argsort_by
 from torchblur.surfaces import Surfaces
 from torchblur.texture_bends import TexturePaths
@@ -50,7 +49,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Varying:
-    """What varies within cells: the paths of their layers with texture or light, over spans."""
+    """What varies within cells: the paths of their layers whose look depends on time, over spans."""
 
     cell: Tensor  # (n,) int64 cell of each span
     start: Tensor  # (n,) share of the cell
@@ -83,7 +82,7 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
     """
     surfaces = prisms.surfaces
     face = prisms.face_of[intervals.prism[cells.layer_interval]]
-    if len(needing_points(surfaces, face)) == 0:
+    if not surfaces.is_varying[face].any():
         return None
     spans = cut_spans(prisms, intervals, cells, knots)
     paths = follow(prisms, intervals, cells, spans)

@@ -1,9 +1,9 @@
 """Paths: what the layers of cells do over slices of time, as polynomials.
 
-Before: cells.py, shading.py.  After: texture_bends.py, light_bends.py, nodes.py.
+Before: cells.py.  After: texture_bends.py, light_bends.py, nodes.py.
 Symbols: spans are slices of cells in which neither the shutter nor a light has a knot; K pairs of a span and one of the
-layers with texture or light in its cell; tau in [0, 1] is time in the span; S = e_0 + e_1 + e_2. An attribute of the
-point at the ray is sum(e_i s_i) / S. All polynomials are kept by their Bernstein coefficients over the span.
+layers in its cell whose look varies with time; tau in [0, 1] is time in the span; S = e_0 + e_1 + e_2. An attribute of
+the point at the ray is sum(e_i s_i) / S. All polynomials are kept by their Bernstein coefficients over the span.
 Source: Ronnow et al. 2022, eq. 1 and 2; polynomial form ours.
 """
 
@@ -19,7 +19,6 @@ from torchblur.cells import Cells
 from torchblur.edges import Corners
 from torchblur.intervals import Intervals
 from torchblur.prisms import Prisms
-from torchblur.shading import needing_points
 from torchblur.sort import argsort_by
 
 SAME_TIME = 1e-12  # of the cell
@@ -37,7 +36,7 @@ class Spans:
 
 @dataclass(frozen=True)
 class Paths:
-    """The layers with texture or light of spans."""
+    """The layers of spans whose look varies with time."""
 
     span: Tensor  # (K,) int64, sorted
     prism: Tensor  # (K,) int64
@@ -73,7 +72,7 @@ def cut_spans(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[T
     Source: ours.
     """
     face = prisms.face_of[intervals.prism[cells.layer_interval]]
-    cell = torch.unique(packed.owners(cells.layer_offsets)[needing_points(prisms.surfaces, face)])
+    cell = torch.unique(packed.owners(cells.layer_offsets)[prisms.surfaces.is_varying[face]])
     pixel = packed.owners(cells.offsets)[cell]
     times, delays = knots
     still = torch.tensor(sorted({t for light in prisms.surfaces.lights for t in light.knots}), dtype=torch.float64)
@@ -125,12 +124,12 @@ def between(owner: Tensor, tau: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def follow(prisms: Prisms, intervals: Intervals, cells: Cells, spans: Spans) -> Paths:
-    """Return the paths of the layers with texture or light in the cells of `spans`. Source: ours."""
+    """Return the paths of the layers in the cells of `spans` whose look varies with time. Source: ours."""
     counts = cells.layer_offsets.diff()[spans.cell]
     layer, span = packed.expand(cells.layer_offsets[spans.cell], counts)
     interval = cells.layer_interval[layer]
     face = prisms.face_of[intervals.prism[interval]]
-    varying = needing_points(prisms.surfaces, face)
+    varying = prisms.surfaces.is_varying[face].nonzero().flatten()
     interval, span, face = interval[varying], span[varying], face[varying]
     prism = intervals.prism[interval]
     t = spans.t[:, span]

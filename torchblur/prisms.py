@@ -72,7 +72,8 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
     for i, mesh in enumerate(scene.meshes):
         if mesh.n_faces == 0:
             continue
-        times = window_times(scene, mesh, window)
+        is_static = scene.is_still(mesh)
+        times = list(window) if is_static else window_times(scene, mesh, window)
         face = torch.arange(mesh.n_faces, device=scene.device) + surfaces.first_face[i]
         if not surfaces.opacity.requires_grad:
             face = face[surfaces.opacity[face] > 0]
@@ -80,7 +81,6 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
         at = torch.tensor(times, dtype=torch.float64, device=scene.device)
         clip_vertices = scene.clip_at(mesh, at)
         attributes = [mesh.vertices_at(at), mesh.normals_at(at)] if surfaces.is_lit.any() else []
-        is_static = mesh.n_segments == camera.n_segments == 0
         for k in range(len(times) - 1):
             clip_open = clip_vertices[k, corners].permute(1, 2, 0)  # (3, 4, F)
             clip_close = clip_open if is_static else clip_vertices[k + 1, corners].permute(1, 2, 0)

@@ -18,7 +18,9 @@ from torchblur import check, packed
 from torchblur.accuracy import Accuracy
 from torchblur.camera import MAX_RAYS, Ray, pixel_rays
 from torchblur.cells import count_layers, cut_cells
-from torchblur.intervals import Intervals, find_intervals
+from torchblur.effects import EffectPlan, agree_plan, check_effects, follow_plan, plan_prisms
+from torchblur.hidden import find_visible_intervals
+from torchblur.intervals import Intervals
 from torchblur.nodes import estimate_bytes, estimate_path_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.paths import cut_at_knots
@@ -28,11 +30,13 @@ from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.subdivide import approximate
 from torchblur.surfaces import Surfaces, build_surfaces
+from torchblur.survey import Survey, survey_prisms
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 MIN_MEMORY_BYTES = 1 << 20
-COUNTS = ("prisms", "blocks", "pairs", "intervals", "cells", "layers", "crossings", "nodes", "deepest_pixel")
-STAGES = ("prisms", "intervals", "cells", "resolve")
+COUNTS = ("prisms", "blocks", "pairs", "still_pairs", "hidden_pairs", "intervals", "cells", "layers", "crossings")
+COUNTS += ("nodes", "deepest_pixel")
+STAGES = ("prisms", "plan", "intervals", "cells", "nodes", "resolve")
 
 
 @dataclass(frozen=True)
@@ -43,6 +47,7 @@ class Frame:
     coverage: Tensor  # (H, W, M) share of the shutter's window in which each mesh is visible at the pixel
     counts: dict[str, int]  # how many of COUNTS
     timings: dict[str, float]  # seconds in each of STAGES
+    plan: EffectPlan  # which effects were simulated, and why
 
 
 @dataclass
@@ -71,6 +76,7 @@ def render(
     scene: Scene,
     *,
     accuracy: Accuracy | None = None,
+    effects: str | EffectPlan = "auto",
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
@@ -80,6 +86,8 @@ def render(
     Args:
         scene: what to render; the frame has its device, and the floating type of its vertices.
         accuracy: `Accuracy.exact()` if None.
+        effects: "auto" leaves out what the scene does not call for, which does not change the image; "all" leaves out
+            nothing; a plan, of `plan_effects`, simulates what it says, and must hold all that the scene needs.
         shutter: `Shutter.box()`, the whole exposure, if None.
         rays_per_pixel: 1 looks through the pixel's centre only; more rays, each exact in time, are spread inside the
             pixel and averaged (box filter).
@@ -89,7 +97,7 @@ def render(
             that needs more gets it.
 
     Returns:
-        A frame with `rgba` (H, W, 4), `coverage` (H, W, M), counts and timings.
+        A frame with `rgba` (H, W, 4), `coverage` (H, W, M), counts, timings and the plan.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -106,15 +114,16 @@ def render(
         0.25
     """
     shutters = (Shutter.box() if shutter is None else shutter,)
-    job = _checked_job(scene, shutters, accuracy, rays_per_pixel, memory_bytes)
-    return job.frames(rays_per_pixel)[0]
+    job = _checked_job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes)
+    return job.frames()[0]
 
 
-def render_windows(
+def render_windows(  # noqa: PLR0913  as render, and the windows
     scene: Scene,
     windows: Sequence[tuple[float, float]],
     *,
     accuracy: Accuracy | None = None,
+    effects: str | EffectPlan = "auto",
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
@@ -125,7 +134,7 @@ def render_windows(
         scene: what to render.
         windows: parts (start, end) of the exposure [shutter time]; they may overlap.
         shutter: whose weight applies inside each window, with unit integral; `Shutter.box()` if None.
-        accuracy, rays_per_pixel, memory_bytes: as in `render`.
+        accuracy, effects, rays_per_pixel, memory_bytes: as in `render`.
 
     Returns:
         One frame a window, each what `render` returns for `shutter.window(start, end)`; they share counts and timings.
@@ -143,12 +152,17 @@ def render_windows(
     if not windows:
         raise check.fail("windows", "at least one pair (start, end)", windows)
     shutters = tuple(whole.window(start, end) for start, end in windows)
-    job = _checked_job(scene, shutters, accuracy, rays_per_pixel, memory_bytes)
-    return tuple(job.frames(rays_per_pixel))
+    job = _checked_job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes)
+    return tuple(job.frames())
 
 
 def _checked_job(
-    scene: Scene, shutters: tuple[Shutter, ...], accuracy: Accuracy | None, rays_per_pixel: int, memory_bytes: int
+    scene: Scene,
+    shutters: tuple[Shutter, ...],
+    accuracy: Accuracy | None,
+    effects: str | EffectPlan,
+    rays_per_pixel: int,
+    memory_bytes: int,
 ) -> _Job:
     """Return the job of these arguments, or raise naming the wrong one."""
     if not isinstance(scene, Scene):
@@ -159,6 +173,7 @@ def _checked_job(
     moving = [scene.camera.world_to_clip, *(mesh.vertices for mesh in scene.meshes)]
     if accuracy.method != "exact" and torch.is_grad_enabled() and any(m.requires_grad for m in moving):
         raise check.fail("accuracy", "Accuracy.exact(), as vertices or camera ask for gradients", accuracy.method)
+    check_effects(effects)
     for shutter in shutters:
         if not isinstance(shutter, Shutter):
             raise check.fail_type("shutter", "a Shutter", shutter)
@@ -166,7 +181,17 @@ def _checked_job(
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
     if check.positive_int("memory_bytes", memory_bytes) < MIN_MEMORY_BYTES:
         raise check.fail("memory_bytes", f"at least {MIN_MEMORY_BYTES}", memory_bytes)
-    return _Job(scene, shutters, accuracy, memory_bytes, _Ledger())
+    return _Job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes, _Ledger())
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What there is to render, and what of it to simulate."""
+
+    plan: EffectPlan
+    prisms: Prisms
+    survey: Survey
+    chosen: Tensor  # (C,) int64 the prisms to look at
 
 
 @dataclass(frozen=True)
@@ -176,10 +201,12 @@ class _Job:
     scene: Scene
     shutters: tuple[Shutter, ...]
     accuracy: Accuracy
+    effects: str | EffectPlan
+    rays_per_pixel: int
     memory_bytes: int
     ledger: _Ledger
 
-    def frames(self, rays_per_pixel: int) -> list[Frame]:
+    def frames(self) -> list[Frame]:
         """Return a frame for each shutter."""
         scene, ledger = self.scene, self.ledger
         spans = [s.span(s.n_lines(scene.camera.width, scene.camera.height)) for s in self.shutters]
@@ -189,29 +216,38 @@ class _Job:
                 surfaces = build_surfaces(scene)
                 prisms = build_prisms(scene, surfaces, window)
             ledger.add("prisms", prisms.count)
-            total = sum(self._image(prisms, ray) for ray in pixel_rays(rays_per_pixel)) / rays_per_pixel
-            return [self._frame(image) for image in total]
+            with ledger.stage("plan", scene.device):
+                survey = survey_prisms(prisms, (scene.camera.width, scene.camera.height))
+                own = plan_prisms(scene, (prisms, survey), self.accuracy, self.rays_per_pixel)
+                plan = agree_plan(self.effects, own)
+                prisms, survey, chosen = follow_plan(plan, prisms, survey, self.accuracy)
+            work = _Work(plan, prisms, survey, chosen)
+            total = sum(self._image(work, ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
+            return [self._frame(image, plan) for image in total]
 
-    def _frame(self, image: Tensor) -> Frame:
+    def _frame(self, image: Tensor, plan: EffectPlan) -> Frame:
         """Return the frame of (H, W, 4 + M) premultiplied colour, alpha and coverage."""
         scene = self.scene
         rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., 4:]
         for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
-        return Frame(rgba, coverage.to(scene.dtype), self.ledger.counts, self.ledger.timings)
+        return Frame(rgba, coverage.to(scene.dtype), self.ledger.counts, self.ledger.timings, plan)
 
-    def _image(self, prisms: Prisms, ray: Ray) -> Tensor:
+    def _image(self, work: _Work, ray: Ray) -> Tensor:
         """Return (shutters, H, W, 4 + M) float64: premultiplied colour, alpha and coverage for one ray per pixel."""
         camera, device = self.scene.camera, self.scene.device
         whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
-        every = torch.arange(prisms.count, device=device)
+        prisms, accuracy = work.prisms, self.accuracy
+        if accuracy.method == "adaptive" and "curvature" not in work.plan.simulated:
+            accuracy = Accuracy.linear()
         places, values = [], []
-        for block, candidates in self._blocks(prisms, whole, every):
+        for block, candidates in self._blocks(prisms, whole, work.chosen):
             with self.ledger.stage("intervals", device):
-                intervals, n_pairs = find_intervals(prisms, block, candidates)
-                intervals = approximate(prisms, intervals, self.accuracy)
+                intervals, counts = find_visible_intervals(prisms, work.survey, block, candidates)
+                intervals = approximate(prisms, intervals, accuracy)
             self.ledger.add("blocks", 1)
-            self.ledger.add("pairs", n_pairs)
+            for name, n in counts.items():
+                self.ledger.add(name, n)
             self.ledger.add("intervals", intervals.count)
             if intervals.count == 0:
                 continue
@@ -219,37 +255,37 @@ class _Job:
             for pixels in self._chunks(prisms.surfaces, intervals):
                 column, row = block.x0 + pixels % block.width, block.y0 + pixels // block.width
                 places.append(row * camera.width + column)
-                values.append(self._resolve(prisms, intervals.of_pixels(pixels), (column, row)))
+                values.append(self._resolve(work, intervals.of_pixels(pixels), (column, row)))
         n_pixels, n_channels = camera.height * camera.width, 4 + len(self.scene.meshes)
         image = torch.zeros(n_pixels, len(self.shutters), n_channels, dtype=torch.float64, device=device)
         if places:
             image = image.index_put((torch.cat(places),), torch.cat(values))
         return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
 
-    def _resolve(
-        self, prisms: Prisms, intervals: Intervals, pixel: tuple[Tensor, Tensor], whole: bool = True
-    ) -> Tensor:
+    def _resolve(self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], whole: bool = True) -> Tensor:
         """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`, if `whole` in portions that fit."""
         camera, device = self.scene.camera, self.scene.device
-        column, row = pixel
+        prisms, (column, row) = work.prisms, pixel
         is_exact = self.accuracy.method == "exact"
         lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
         with self.ledger.stage("cells", device):
-            cells = cut_cells(prisms, intervals)
+            cells = cut_cells(prisms, intervals, "crossings" in work.plan.simulated)
             cells = cells if is_exact else cut_at_knots(cells, self._knots(lines))
+        with self.ledger.stage("nodes", device):
             varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
             n_bytes = estimate_bytes(prisms, cells, varying)
         if whole and float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
             parts = []
             for chosen in _portions(n_bytes, self.memory_bytes):
-                parts.append(self._resolve(prisms, intervals.of_pixels(chosen), (column[chosen], row[chosen]), False))
+                parts.append(self._resolve(work, intervals.of_pixels(chosen), (column[chosen], row[chosen]), False))
             return torch.cat(parts)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
         self.ledger.add("crossings", cells.n_crossings)
-        with self.ledger.stage("resolve", device):
+        with self.ledger.stage("nodes", device):
             samples = place_samples(prisms, cells, varying)
-            self.ledger.add("nodes", len(samples.cell))
+        self.ledger.add("nodes", len(samples.cell))
+        with self.ledger.stage("resolve", device):
             pixel_of = packed.owners(cells.offsets)[samples.cell]
             offsets = packed.offsets_from_owners(pixel_of, len(column))
             composite = composite_samples(prisms, intervals, cells, samples, self.accuracy)

@@ -187,6 +187,14 @@ class Scene:
         """Return the shutter times at which the linear pieces of a mesh's motion on screen meet, 0 and 1 included."""
         return sorted({k / n for n in (mesh.n_segments, self.camera.n_segments, 1) for k in range(n + 1) if n})
 
+    def is_still(self, mesh: Mesh) -> bool:
+        """Return whether a mesh rests under the camera: no knot of either, nor of its normals, differs from another.
+
+        What has knots and asks for gradients counts as moving: each knot has its own. Source: ours.
+        """
+        knots = [self.camera.world_to_clip, mesh.vertices, *([] if mesh.normals is None else [mesh.normals])]
+        return all(k.ndim == 2 or (not k.requires_grad and bool((k == k[:1]).all())) for k in knots)
+
     def clip_at(self, mesh: Mesh, t: Tensor) -> Tensor:
         """Return (B, V, 4) float64 clip-space vertices of `mesh` at the shutter times `t` (B,).
 

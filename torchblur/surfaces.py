@@ -31,6 +31,7 @@ class Surfaces:
     has_varying_opacity: Tensor  # (F,) bool: its texture has opacities below 1, or asks for gradients
     uv: Tensor  # (F, 3, 2) float64 texture coordinates of the corners; 0 without texture
     atlas: Atlas
+    is_varying: Tensor  # (F,) bool: its look may change while the shutter is open
     is_lit: Tensor  # (F,) bool: shows its colour times the light that it gets
     has_normals: Tensor  # (F,) bool: its corners have normals; otherwise it is flat
     lights: tuple[Light, ...]
@@ -64,6 +65,12 @@ def build_surfaces(scene: Scene) -> Surfaces:
         return cat(parts, (0,), torch.bool)
 
     is_opaque = (opacity.detach() == 1) & ~per_face(varies)
+    lights_move = any(p.ndim == 2 for light in scene.lights for p in light.tensors().values())
+    varying = [
+        (m.material.texture is not None and not scene.is_still(m))
+        or (m.material.shading == "lambert" and bool(scene.lights) and (lights_move or not scene.is_still(m)))
+        for m in meshes
+    ]
     return Surfaces(
         rgb=cat([m.face_rgb() for m in meshes], (0, 3), f64),
         opacity=opacity,
@@ -75,6 +82,7 @@ def build_surfaces(scene: Scene) -> Surfaces:
         has_varying_opacity=per_face(varies),
         uv=cat([_face_uv(m) for m in meshes], (0, 3, 2), f64),
         atlas=build_atlas(meshes, device),
+        is_varying=per_face(varying),
         is_lit=per_face([m.material.shading == "lambert" for m in meshes]),
         has_normals=per_face([m.normals is not None for m in meshes]),
         lights=scene.lights,

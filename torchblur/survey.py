@@ -1,0 +1,103 @@
+"""What prisms can do at most: cheap conservative bounds by which effects are left out.
+
+Before: prisms.py.  After: hidden.py, effects.py.
+Symbols: P prisms; D(t) = det(p_0, p_1, p_2) of their clip-space corners without z, a cubic whose sign is the facing.
+Nearness as in intervals.py: larger in front, between those of the six corners while all w are above 0.
+Source: signs of Bernstein coefficients; bounds by corners: the hit point is a mean of them. Ours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from torchblur import packed
+from torchblur.prisms import Prisms
+
+NOISE = 1e-13  # of the product of the corners' sizes: smaller D may be rounding
+GRIDS = (32, 16, 8, 4, 2, 1)  # tiles along a side
+TOUCHING = 1e-12  # of the nearness: smaller overlaps are rounding, as in cells.py
+MAX_PLACES = 8  # a prism and slice of time on average, else the grid is coarser
+
+
+@dataclass(frozen=True)
+class Survey:
+    """Bounds of the prisms of a scene; what is not certain counts as it costs more."""
+
+    is_still: Tensor  # (P,) bool: rests on screen all through the window
+    hides: Tensor  # (P,) bool: opaque at all times, so that nothing behind it is seen
+    facing: Tensor  # (P,) int8: +1 shows its front at all times, -1 its back; 0 may turn, or reaches behind the eye
+    nearness: Tensor  # (2, P) least and greatest; -inf and inf where w may be 0
+    may_cross: bool  # whether the order in depth of two prisms may change in time
+
+
+@torch.no_grad()
+def survey_prisms(prisms: Prisms, size_px: tuple[int, int]) -> Survey:
+    """Return the bounds of all prisms on an image of width and height `size_px`. Source: ours."""
+    start, end = prisms.window
+    rests = (prisms.clip[0] == prisms.clip[1]).all(0).all(0)
+    whole = (prisms.t_open == start) & (prisms.t_close == end)
+    nearness = _nearness_range(prisms)
+    return Survey(
+        is_still=rests & whole & ~prisms.is_clipped,
+        hides=prisms.surfaces.is_opaque[prisms.face_of],
+        facing=_facing(prisms),
+        nearness=nearness,
+        may_cross=_may_cross(prisms, nearness, size_px),
+    )
+
+
+def _nearness_range(prisms: Prisms) -> Tensor:
+    """Return (2, P) the least and greatest nearness of the corners."""
+    z, w = prisms.clip[:, :, 2].flatten(0, 1), prisms.clip[:, :, 3].flatten(0, 1)
+    is_proper = (w > 0).all(0) & ~prisms.is_clipped
+    safe = torch.where(w > 0, w, 1.0)
+    nearness = 1 / safe if prisms.orders_by_w else 2 - z / safe
+    low = torch.where(is_proper, nearness.amin(0), -torch.inf)
+    return torch.stack([low, torch.where(is_proper, nearness.amax(0), torch.inf)])
+
+
+def _facing(prisms: Prisms) -> Tensor:
+    """Return (P,) int8 the side that is seen: D keeps its sign where its Bernstein coefficients have one."""
+    a, b = prisms.clip[:, :, [0, 1, 3]]  # (3 corners, x y w, P)
+    rows = torch.zeros_like(a[0, 0].expand(4, -1))
+    for ends in range(8):  # the blossom: each corner from either end
+        at = [b[i] if ends >> i & 1 else a[i] for i in range(3)]
+        k = ends.bit_count()
+        rows[k] += (at[0] * torch.linalg.cross(at[1], at[2], dim=0)).sum(0) / (1, 3, 3, 1)[k]
+    size = torch.maximum(a.norm(dim=1), b.norm(dim=1)).prod(0)
+    rows = rows * prisms.parity
+    sure = (rows > NOISE * size).all(0).to(torch.int8) - (rows < -NOISE * size).all(0).to(torch.int8)
+    return torch.where(prisms.is_clipped, 0, sure)
+
+
+def _may_cross(prisms: Prisms, nearness: Tensor, size_px: tuple[int, int]) -> bool:
+    """Return whether the nearness of two prisms overlaps in one tile of the screen and slice of time.
+
+    Ranges that only touch keep their order: those of faces in one plane at rest in depth, or one in front of another.
+    """
+    if prisms.count < 2:
+        return False
+    knots = torch.unique(torch.cat([prisms.t_open, prisms.t_close]))
+    slices = [torch.searchsorted(knots, t) for t in (prisms.t_open, prisms.t_close)]
+    n_slices = slices[1] - slices[0]
+    size = torch.tensor(size_px, dtype=torch.float64, device=knots.device).unsqueeze(1)
+    low, high = (torch.minimum(b.clamp(min=0), size) / size for b in (prisms.bounds_px[:2], prisms.bounds_px[2:]))
+    for n in GRIDS:
+        first, last = ((b * n).floor().clamp(max=n - 1).long() for b in (low, high))
+        spans = last - first + 1
+        places = spans.prod(0) * n_slices
+        if int(places.sum()) <= MAX_PLACES * int(n_slices.sum()):
+            break
+    index, of = packed.expand(torch.zeros_like(places), places)
+    column = first[0, of] + index % spans[0, of]
+    row = first[1, of] + index // spans[0, of] % spans[1, of]
+    time = slices[0][of] + index // (spans[0] * spans[1])[of]
+    place = (time * n + row) * n + column
+    order = torch.sort(nearness[0, of], stable=True).indices
+    order = order[torch.sort(place[order], stable=True).indices]
+    place, (least, greatest) = place[order], nearness[:, of[order]]
+    # sorted by their least, two overlap somewhere just if two neighbours do
+    return bool(((place[1:] == place[:-1]) & (least[1:] * (1 + TOUCHING) < greatest[:-1])).any())

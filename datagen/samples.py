@@ -114,7 +114,8 @@ def render_sample(clip: Clip, plan: Plan, index: int, frame: int) -> Sample:
         mesh_id=now.mesh_id,
         face_id=now.face_id,
         coverage=blurred.coverage,
-        meta=_metadata(clip, exposure, plan, index, times) | {"counts": dict(sorted(blurred.counts.items()))},
+        meta=_metadata(clip, exposure, plan, index, times)
+        | {"counts": dict(sorted(blurred.counts.items())), "plan": blurred.plan.to_dict()},
     )
 
 

@@ -20,7 +20,7 @@ from torchblur.prisms import Prisms, build_prisms
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
-from torchblur.survey import Survey, survey_prisms
+from torchblur.survey import Survey, shows_back, survey_prisms
 
 SWITCHED = ("motion", "transparency", "clipping", "facing", "crossings", "curvature")  # that rendering can leave out
 WIDTHS = (13, 8, 46, 46)  # characters of the printed columns
@@ -132,7 +132,9 @@ def plan_effects(
 @torch.no_grad()
 def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, rays_per_pixel: int) -> EffectPlan:
     """Return the plan of a scene whose prisms and their survey are `seen`. Source: ours."""
-    prisms, survey = seen
+    away = shows_back(seen[0], seen[1].facing)
+    chosen = (~away).nonzero().flatten()
+    prisms, survey = (part.choose(chosen) for part in seen)
     surfaces = prisms.surfaces
     textures = [mesh.material.texture for mesh in scene.meshes]
     opacity = []
@@ -146,7 +148,7 @@ def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, r
         _texture(prisms, textures),
         _lighting(prisms),
         _clipping(prisms),
-        _facing(prisms, survey),
+        _facing(prisms, survey, int(away.sum())),
         _crossings(prisms, survey),
         _curvature(prisms, survey, accuracy),
         _rays(scene, rays_per_pixel),
@@ -223,12 +225,12 @@ def _clipping(prisms: Prisms) -> Effect:
     return Effect("clipping", True, why, "their rays solve two cubics more")
 
 
-def _facing(prisms: Prisms, survey: Survey) -> Effect:
+def _facing(prisms: Prisms, survey: Survey, n_away: int) -> Effect:
     one_sided = prisms.surfaces.is_one_sided[prisms.face_of]
-    turning, away = (int((one_sided & (survey.facing == side)).sum()) for side in (0, -1))
-    cost = f"{away:,} prisms that show their backs are left out" if away else "none"
+    turning = int((one_sided & (survey.facing == 0)).sum())
+    cost = f"{n_away:,} prisms that show their backs are left out" if n_away else "none"
     if turning == 0:
-        why = "every one-sided face shows one side" if one_sided.any() else "no face in view is one-sided"
+        why = "every one-sided face shows one side" if n_away or one_sided.any() else "no face in view is one-sided"
         return Effect("facing", False, why, cost)
     return Effect("facing", True, f"{turning:,} one-sided prisms may turn or pass the eye", cost)
 
@@ -280,7 +282,7 @@ def agree_plan(effects: str | EffectPlan, own: EffectPlan) -> EffectPlan:
     missing = sorted(own.needed - effects.simulated)
     if missing:
         raise check.fail("effects", f"a plan with {', '.join(missing)}, which the scene needs", "one without")
-    forced = [name for name in SWITCHED if name in effects.simulated - own.needed]
+    forced = [name for name in SWITCHED if effects[name].forced or name in effects.simulated - own.needed]
     return own.forcing(*forced) if forced else own
 
 
@@ -309,5 +311,5 @@ def follow_plan(plan: EffectPlan, prisms: Prisms, survey: Survey, accuracy: Accu
         survey = replace(survey, is_still=never)
     if "transparency" in forced or cuts_matter:
         survey = replace(survey, hides=never)
-    away = never if "facing" in forced else surfaces.is_one_sided[prisms.face_of] & (survey.facing < 0)
+    away = never if "facing" in forced else shows_back(prisms, survey.facing)
     return prisms, survey, (~away).nonzero().flatten()

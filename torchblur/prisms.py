@@ -10,7 +10,7 @@ Source: Ronnow et al. 2021, sec. 3 (prism); near-clipped bounds, canonical order
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -47,6 +47,14 @@ class Prisms:
     def count(self) -> int:
         """Number of prisms."""
         return len(self.face_of)
+
+    def choose(self, chosen: Tensor) -> Prisms:
+        """Return the prisms `chosen` (C,)."""
+        ends = ("clip", "t_open", "t_close", "face_of", "corner_of", "parity", "is_clipped", "bounds_px", "corners_px")
+        parts = {name: getattr(self, name)[..., chosen] for name in ends}
+        if self.world.shape[-1]:
+            parts |= {"world": self.world[..., chosen], "normal": self.normal[..., chosen]}
+        return replace(self, **parts)
 
     def corner_uv(self, prism: Tensor) -> Tensor:
         """Return (2, 3, K) texture coordinates of the corners of prisms `prism` (K,) in their stored order."""

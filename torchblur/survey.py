@@ -8,7 +8,7 @@ Source: signs of Bernstein coefficients; bounds by corners: the hit point is a m
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -32,6 +32,11 @@ class Survey:
     nearness: Tensor  # (2, P) least and greatest; -inf and inf where w may be 0
     may_cross: bool  # whether the order in depth of two prisms may change in time
 
+    def choose(self, chosen: Tensor) -> Survey:
+        """Return the bounds of the prisms `chosen` (C,)."""
+        parts = {name: getattr(self, name)[..., chosen] for name in ("is_still", "hides", "facing", "nearness")}
+        return replace(self, **parts)
+
 
 @torch.no_grad()
 def survey_prisms(prisms: Prisms, size_px: tuple[int, int]) -> Survey:
@@ -39,14 +44,20 @@ def survey_prisms(prisms: Prisms, size_px: tuple[int, int]) -> Survey:
     start, end = prisms.window
     rests = (prisms.clip[0] == prisms.clip[1]).all(0).all(0)
     whole = (prisms.t_open == start) & (prisms.t_close == end)
-    nearness = _nearness_range(prisms)
+    nearness, facing = _nearness_range(prisms), _facing(prisms)
+    seen = (~shows_back(prisms, facing)).nonzero().flatten()
     return Survey(
         is_still=rests & whole & ~prisms.is_clipped,
         hides=prisms.surfaces.is_opaque[prisms.face_of],
-        facing=_facing(prisms),
+        facing=facing,
         nearness=nearness,
-        may_cross=_may_cross(prisms, nearness, size_px),
+        may_cross=_may_cross(prisms.choose(seen), nearness[:, seen], size_px),
     )
+
+
+def shows_back(prisms: Prisms, facing: Tensor) -> Tensor:
+    """Return (P,) whether a one-sided prism shows only its back, by its `facing`: nothing of it is seen. Ours."""
+    return prisms.surfaces.is_one_sided[prisms.face_of] & (facing < 0)
 
 
 def _nearness_range(prisms: Prisms) -> Tensor:

@@ -18,6 +18,7 @@ from torch import Tensor
 import torchblur as tb
 from datagen.baselines.shadow_samples import MovingFaces, boxes_px, centres_ndc, pixels_in
 from torchblur import check
+from torchblur.lights import unit
 
 MAX_SPOT_DEG = 80.0  # a wider cone does not fit one view
 MARGIN = 1.001  # of a view over what it must hold
@@ -98,7 +99,8 @@ def view_from_light(scene: tb.Scene, faces: MovingFaces, size_px: int) -> LightV
             math.tan(math.radians(light.outer_angle_deg)),
         )
     else:
-        axes, slope = [*torch.eye(3).to(position), *-torch.eye(3).to(position)], 1.0
+        sides = torch.eye(3).to(position)
+        axes, slope = [*sides, *-sides], 1.0
     matrices = []
     for axis in axes:
         frame = _frame(axis)
@@ -134,7 +136,7 @@ def rasterise(views: LightViews, corners: Tensor, view: Tensor) -> Texels:
 
 def _frame(axis: Tensor) -> Tensor:
     """Return rows x, y, forward (3, 3) of length 1; seen along `axis`, x is to the right of y."""
-    forward = torch.nn.functional.normalize(axis, dim=0)
-    helper = torch.eye(3).to(axis)[forward.abs().argmin()]
-    x = torch.nn.functional.normalize(torch.linalg.cross(forward, helper), dim=0)
+    forward = unit(axis)
+    other = torch.eye(3, dtype=axis.dtype, device=axis.device)[forward.abs().argmin()]
+    x = unit(torch.linalg.cross(forward, other))
     return torch.stack([x, torch.linalg.cross(x, forward), forward])

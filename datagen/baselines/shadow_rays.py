@@ -13,6 +13,7 @@ from torch import Tensor
 import torchblur as tb
 from datagen.baselines.shadow_samples import Hits, MovingFaces, ShadowedImage, average_samples, gather_faces
 from torchblur import check
+from torchblur.lights import unit
 
 MAX_TESTS = 2_000_000  # rays and faces looked at together
 SKIPPED = 1e-9  # share of the way to the light that rays skip
@@ -49,7 +50,7 @@ def _visible_at(light: object, faces: MovingFaces, t: float, hits: tuple[Tensor,
     corner, face = faces.world_at(t)
     if isinstance(light, tb.DirectionalLight):
         origin = corner.new_zeros(3)
-        way = -torch.nn.functional.normalize(light.direction.to(corner).reshape(-1, 3)[0], dim=0)
+        way = -unit(light.direction.to(corner).reshape(-1, 3)[0])
     else:
         origin, way = light.position.to(corner).reshape(-1, 3)[0], None
     corner = corner - origin

@@ -19,7 +19,9 @@ from torch import Tensor
 
 import torchblur as tb
 from torchblur import check, packed
+from torchblur.lights import unit
 
+NEAR = 1e-4  # nothing nearer is drawn
 MAX_TESTS = 2_000_000  # samples and moving faces looked at together: a few hundred MB of working memory
 
 
@@ -152,19 +154,22 @@ def average_samples(
 
 
 def boxes_px(xyw: Tensor, width: int, height: int) -> Tensor:
-    """Return x0 y0 x1 y1 (4, T) int64, inclusive, of the pixels that hold corners (T, C, 3), x and y in NDC times w.
-
-    Where some corners have w <= 0 these are all pixels, where all have, none.
+    """Return x0 y0 x1 y1 (4, T) int64, inclusive, of the pixels that hold the hull of corners (T, C, 3), x and y in NDC
+    times w, as far as it lies beyond w = NEAR of the largest w.
     """
-    w = xyw[..., 2]
-    nowhere, anywhere = (w <= 0).all(1), (w <= 0).any(1)
-    place = xyw[..., :2] / torch.where(w > 0, w, 1.0).unsqueeze(-1)
+    near = NEAR * xyw[..., 2].abs().amax(1, keepdim=True)
+    one, two = torch.combinations(torch.arange(xyw.shape[1], device=xyw.device)).unbind(1)
+    start, step, depth = xyw[:, one], xyw[:, two] - xyw[:, one], xyw[..., 2]
+    cuts = (depth[:, one] > near) != (depth[:, two] > near)
+    share = (near - start[..., 2]) / torch.where(cuts, step[..., 2], 1.0)
+    point = torch.cat([xyw, start + share.unsqueeze(2) * step], dim=1)
+    counts = torch.cat([depth > near, cuts], dim=1)
+    place = point[..., :2] / torch.where(counts, torch.maximum(point[..., 2], near), 1.0).unsqueeze(2)
     low, high = [], []
     for axis, size, sign in ((0, width, 1), (1, height, -1)):
         at = (sign * place[..., axis] + 1) * (size / 2) - 0.5
-        first, last = (at.amin(1) - 1e-6).clamp(0, size).ceil(), (at.amax(1) + 1e-6).clamp(-1, size - 1).floor()
-        low.append(torch.where(anywhere, 0, first))
-        high.append(torch.where(nowhere, -1, torch.where(anywhere, size - 1, last)))
+        low.append((torch.where(counts, at, torch.inf).amin(1) - 1e-6).clamp(0, size).ceil())
+        high.append((torch.where(counts, at, -torch.inf).amax(1) + 1e-6).clamp(-1, size - 1).floor())
     return torch.stack([*low, *high]).long()
 
 
@@ -178,7 +183,8 @@ def pixels_in(box: Tensor, width: int) -> tuple[Tensor, Tensor]:
 
 def centres_ndc(pixel: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]:
     """Return x and y of the pixels' centres, y up."""
-    return 2 * (pixel % width + 0.5) / width - 1, 1 - 2 * (pixel // width + 0.5) / height
+    column, row = (pixel % width).to(torch.float64), (pixel // width).to(torch.float64)
+    return 2 * (column + 0.5) / width - 1, 1 - 2 * (row + 0.5) / height
 
 
 def _swept_pairs(scene: tb.Scene, faces: MovingFaces) -> tuple[Tensor, Tensor]:
@@ -230,7 +236,7 @@ def _find_hits(scene: tb.Scene, faces: MovingFaces, pairs: tuple, samples: tuple
         t=t,
         face=faces.face[moving],
         world=(weight.unsqueeze(2) * corner).sum(1),
-        normal=torch.nn.functional.normalize(normal, dim=1) * side.unsqueeze(1),
+        normal=unit(normal.T).T * side.unsqueeze(1),
         rgb=faces.rgb[moving],
         is_lit=faces.is_lit[moving],
     )

@@ -15,6 +15,7 @@ What is wrong or weak in the paper, and what becomes of it here:
    between patches, several visits) have no rule: they are left out, and counted.
 3. Time is linear in the patches: right where an edge is only displaced, off by up to 0.5 where it turns about one end;
    where the edges cross, part of the swept area is missed. Kept; the time at a crossing is not defined, 0.5 here.
+   An end that rests exactly is a crossing by the paper's test, and then the error is smaller.
 4. Prisms are dropped where the three corners of the last frame are out of view, or the face turns its back to the light
    in both frames, though in between, or as a whole, they may cast. Kept; a point light's six views hold everything.
 5. Leaving out the own face does not protect from its neighbours: a bias is still needed. It is an argument, 0 in the

@@ -216,10 +216,11 @@ def test_what_is_hidden_is_not_solved():
     assert auto.counts["hidden_pairs"] > 0.3 * everything.counts["pairs"]
 
 
-def test_gradients_are_the_same():
+@pytest.mark.parametrize("look", ["faces", "lit"])
+def test_gradients_are_the_same(look):
     bodies = (
         Body("wall", (0, 0, -3), "still", "texture", 1.0, True),
-        Body("box", (0, 0, 0), "shift", "faces", 1.0, True),
+        Body("box", (0, 0, 0), "shift", look, 1.0, True),
     )
     grads = []
     for effects in ("auto", "all"):
@@ -232,7 +233,7 @@ def test_gradients_are_the_same():
         grads.append(torch.autograd.grad((rgba * weight).sum(), leaves))
     for a, b in zip(*grads, strict=True):
         assert float(a.abs().max()) > 0
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9 if look == "faces" else 1e-5)  # by nodes: certified
 
 
 def test_knots_that_ask_for_gradients_move():

@@ -43,7 +43,7 @@ class Samples:
 
     cell: Tensor  # (S,) int64
     t: Tensor  # (S,) float64 shutter time
-    share: Tensor  # (S,) float64 of the cell's length that the sample stands for
+    length: Tensor  # (S,) float64 shutter time that the sample stands for
     is_flat: Tensor  # (S,) bool: stands for its whole cell, in which nothing changes
 
 
@@ -65,7 +65,7 @@ def middle_samples(cells: Cells) -> Samples:
     """Return one sample for each cell, in its middle: exact where nothing changes within cells. Source: ours."""
     every = torch.arange(len(cells.t_start), device=cells.t_start.device)
     middle = 0.5 * (cells.t_start + cells.t_end)
-    return Samples(every, middle, torch.ones_like(middle), torch.ones_like(every, dtype=torch.bool))
+    return Samples(every, middle, cells.t_end - cells.t_start, torch.ones_like(every, dtype=torch.bool))
 
 
 @torch.no_grad()
@@ -149,6 +149,8 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
         varying: of `find_varying`.
 
     Accuracy: certificate.TOLERANCE, certified.
+    Gradient: of times and lengths to the cells' ends. A knot, which cuts a cell at a fixed time, does not move with
+        them; bends may, since there looks only bend.
     Source: Gauss-Legendre quadrature; ours.
     """
     if varying is None:
@@ -165,19 +167,30 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
         taus.append((start[chosen] + length * (0.5 * (place.unsqueeze(1) + 1))).flatten())
         shares.append((length * (0.5 * weight.unsqueeze(1))).flatten())
     span, tau, share = torch.cat(owners), torch.cat(taus), torch.cat(shares)
-    length = varying.end - varying.start
-    is_varying = torch.zeros(len(cells.t_start), dtype=torch.bool, device=device)
-    is_varying[varying.cell] = True
-    rest = (~is_varying).nonzero().flatten()
+    is_flat = torch.ones(len(cells.t_start), dtype=torch.bool, device=device)
+    is_flat[varying.cell] = False
+    rest = is_flat.nonzero().flatten()
     one = torch.ones(len(rest), dtype=torch.float64, device=device)
-    owner = torch.cat([varying.cell[span], rest])
-    tau = torch.cat([varying.start[span] + tau * length[span], 0.5 * one])
-    share = torch.cat([share * length[span], one])
-    order = argsort_by(owner, tau)
-    owner, tau, share = owner[order], tau[order], share[order]
+    owner, tau, share = torch.cat([varying.cell[span], rest]), torch.cat([tau, 0.5 * one]), torch.cat([share, one])
     with torch.enable_grad():
-        t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
-    return Samples(owner, t, share, ~is_varying[owner])
+        starts, ends = _span_ends(cells, varying)
+        start, end = torch.cat([starts[span], cells.t_start[rest]]), torch.cat([ends[span], cells.t_end[rest]])
+        t, length = (1 - tau) * start + tau * end, share * (end - start)
+        order = argsort_by(owner, t.detach())
+        return Samples(owner[order], t[order], length[order], is_flat[owner[order]])
+
+
+def _span_ends(cells: Cells, varying: Varying) -> tuple[Tensor, Tensor]:
+    """Return the shutter times (n,) at which spans start and end, moving where these are the cell's own ends."""
+    t_start, t_end = cells.t_start[varying.cell], cells.t_end[varying.cell]
+    start, end = ((1 - s) * t_start.detach() + s * t_end.detach() for s in (varying.start, varying.end))
+    return torch.where(varying.start == 0, t_start, start), torch.where(varying.end == 1, t_end, end)
+
+
+def _asks_for_slopes(prisms: Prisms) -> bool:
+    """Return whether what looks follow in time asks for gradients."""
+    lights = [tensor for light in prisms.surfaces.lights for tensor in light.tensors().values()]
+    return any(x.requires_grad for x in (prisms.clip, prisms.world, prisms.normal, prisms.surfaces.uv, *lights))
 
 
 @cache
@@ -215,13 +228,13 @@ def _count_nodes(
     prisms: Prisms, varying: Varying, panels: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return panels, halved where necessary, and their numbers of nodes (p,)."""
-    n_spans = len(varying.cell)
+    n_spans, slopes = len(varying.cell), _asks_for_slopes(prisms)
     dividers, lookup = _dividers(prisms, varying), varying.textured.finest_lookup(prisms)
     counts = torch.tensor([*COUNTS, COUNTS[-1]], device=varying.start.device)
     done = []
     for k in range(MAX_HALVINGS + 1):
         span, start, end = panels
-        needed = nodes_needed(dividers, lookup, panels, n_spans)
+        needed = nodes_needed(dividers, lookup, panels, n_spans, slopes)
         place = torch.searchsorted(counts[:-1].to(needed.dtype), needed)
         is_ready = place < len(COUNTS)
         if k >= FREE_HALVINGS:

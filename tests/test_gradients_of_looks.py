@@ -164,3 +164,16 @@ def test_windows(look):
         return torch.stack([frame.rgba for frame in frames])
 
     check_slopes(seen, scene.meshes[1].vertices)
+
+
+@pytest.mark.parametrize("late", [-1e-16, 0.0, 1e-16])
+def test_an_end_that_meets_a_knot_still_moves(late):
+    """A sheet leaves the ray as the weight peaks at 2: moving its edge by dx takes 2 dx, however rounded."""
+    x = [-0.5 - late, 9.0, 9.0, -0.5 - late]
+    start = torch.tensor([[x[k], y, 0.0] for k, y in enumerate((-9.0, -9.0, 8.0, 8.0))], dtype=FLOAT64)
+    vertices = torch.stack([start, start + torch.tensor([1.0, 0.0, 0.0])]).requires_grad_()
+    mesh = tb.Mesh(vertices, [[0, 1, 2], [0, 2, 3]], tb.Material((1.0, 1.0, 1.0), shading="lambert"))
+    camera = tb.Camera(torch.eye(4, dtype=FLOAT64), 1, 1)
+    scene = tb.Scene([mesh], camera, lights=[tb.DirectionalLight((0.0, 0.0, 1.0), np.pi)])
+    tb.render(scene, shutter=tb.Shutter.trapezoid(0.0, 0.5, 0.5, 1.0)).rgba[0, 0, 0].backward()
+    assert float(vertices.grad[:, [0, 3], 0].sum()) == pytest.approx(-2.0, rel=1e-9)

@@ -21,7 +21,7 @@ from torchblur.cells import Cells
 from torchblur.certificate import SCALE_LIMIT, VECTOR_LIMIT, Divider, nodes_needed
 from torchblur.intervals import Intervals
 from torchblur.light_bends import LightPaths
-from torchblur.paths import Paths, between, cut_spans, follow
+from torchblur.paths import SAME_TIME, Paths, between, cut_spans, follow
 from torchblur.prisms import Prisms
 from torchblur.sort import argsort_by
 from torchblur.surfaces import Surfaces
@@ -184,7 +184,8 @@ def _span_ends(cells: Cells, varying: Varying) -> tuple[Tensor, Tensor]:
     """Return the shutter times (n,) at which spans start and end, moving where these are the cell's own ends."""
     t_start, t_end = cells.t_start[varying.cell], cells.t_end[varying.cell]
     start, end = ((1 - s) * t_start.detach() + s * t_end.detach() for s in (varying.start, varying.end))
-    return torch.where(varying.start == 0, t_start, start), torch.where(varying.end == 1, t_end, end)
+    is_first, is_last = varying.start <= SAME_TIME, varying.end >= 1 - SAME_TIME  # as spans so short are left out
+    return torch.where(is_first, t_start, start), torch.where(is_last, t_end, end)
 
 
 def _asks_for_slopes(prisms: Prisms) -> bool:

@@ -78,7 +78,8 @@ def nodes_needed(
     degree = torch.zeros_like(start)  # of how what is looked at may move
     for divider in dividers:
         index, of = _on_panels(divider.span, panels, n_spans)
-        q = _chebyshev(bernstein.restrict(divider.q[..., index], start[of], end[of])).norm(dim=1)
+        q = _chebyshev(bernstein.restrict(divider.q[..., index], start[of], end[of]))
+        q = bernstein.length(q, 1)
         limit = divider.limit(index, 0.5 * (start + end)[of]) if callable(divider.limit) else divider.limit
         sized.append((of, _significant(q, q[0]), limit))
         degree[of] = degree[of].clamp(min=len(q) - 1)

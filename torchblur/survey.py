@@ -79,10 +79,11 @@ def _facing(prisms: Prisms) -> Tensor:
     """Return (P,) int8 the side that is seen: D keeps its sign where its Bernstein coefficients have one."""
     a, b = prisms.clip[:, :, [0, 1, 3]]  # (3 corners, x y w, P)
     rows = torch.zeros_like(a[0, 0].expand(4, -1))
-    for ends in range(8):  # the blossom: each corner from either end
-        at = [b[i] if ends >> i & 1 else a[i] for i in range(3)]
-        k = ends.bit_count()
-        rows[k] += (at[0] * torch.linalg.cross(at[1], at[2], dim=0)).sum(0) / (1, 3, 3, 1)[k]
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the blossom: each corner from either end
+        across = torch.linalg.cross((a, b)[i][1], (a, b)[j][2], dim=0)
+        for end, corner in enumerate((a[0], b[0])):
+            k = i + j + end
+            rows[k] += (corner * across).sum(0) / (1, 3, 3, 1)[k]
     size = torch.maximum(bernstein.length(a, 1), bernstein.length(b, 1)).prod(0)
     rows = rows * prisms.parity
     sure = (rows > NOISE * size).all(0).to(torch.int8) - (rows < -NOISE * size).all(0).to(torch.int8)

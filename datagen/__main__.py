@@ -99,6 +99,8 @@ def _run(spec: Any, arguments: Arguments) -> int:
         print("interrupted; the same command finishes the rest", file=sys.stderr)
         return EXIT_INTERRUPTED
     print(f"{result.made} frames made, {result.kept} kept, {len(result.failed)} failed in {result.folder}")
+    if result.effects:
+        print("effects, in share of the frames: " + ", ".join(f"{n} {s:.0%}" for n, s in result.effects.items()))
     if result.contact_sheet is not None:
         print(f"contact sheet: {result.contact_sheet}")
     for index, reason in result.failed:

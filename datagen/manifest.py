@@ -1,7 +1,8 @@
 """Manifest: which frames of a folder are finished, and what they were made from.
 
 Before: writer.py.  After: runs.py, dataset.py.
-`run.json` holds the specification; `manifest.jsonl` one line for each finished frame, with the checksums of its files.
+`run.json` holds the specification; `manifest.jsonl` one line for each finished frame, with the effects that it called
+for and the checksums of its files.
 A frame counts from the moment its line is on the disk: that line is the commit point.
 A run takes no frame on trust: the bytes of every listed file are compared, and what does not fit is made again.
 """
@@ -252,6 +253,8 @@ def _is_entry(entry: Any) -> bool:
     index, files = entry["index"], entry["files"]
     if type(index) is not int or index < 0 or not isinstance(entry["config_sha256"], str):
         return False
+    if not isinstance(entry["effects"], list) or not all(isinstance(name, str) for name in entry["effects"]):
+        return False
     sums_fit = all(re.fullmatch("[0-9a-f]{64}", file["sha256"]) for file in files)
     return sums_fit and sorted(file["path"] for file in files) == sorted(frame_paths(index).values())
 
@@ -260,7 +263,7 @@ def _damage(folder: Path, entry: dict[str, Any], plan: Plan) -> str:
     """Return what is wrong with a listed frame, or an empty string if every byte of it is as listed."""
     clip, frame = plan.spec.clip_and_frame(entry["index"])
     expected = {"index": entry["index"], "clip": clip, "frame": frame, "config_sha256": plan.config_sha256}
-    if {name: value for name, value in entry.items() if name != "files"} != expected:
+    if {name: value for name, value in entry.items() if name not in ("effects", "files")} != expected:
         return f"its line in {MANIFEST_NAME} is not of this configuration"
     return ", ".join(filter(None, (_file_damage(folder, file) for file in entry["files"])))
 

@@ -1,4 +1,4 @@
-"""Report: a contact sheet of a data set, to be looked at.
+"""Report: a contact sheet of a data set, to be looked at, and what its frames called for.
 
 Before: dataset.py, colour.py, pictures.py.  After: runs.py.
 Symbols: H, W size of a cell. One row a frame: sharp, blurred, motion, depth, alpha.
@@ -7,7 +7,10 @@ Symbols: H, W size of a cell. One row a frame: sharp, blurred, motion, depth, al
 from __future__ import annotations
 
 import json
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,6 +65,22 @@ def write_contact_sheet(folder: str | Path) -> Path:
     path = Path(folder) / SHEET_NAME
     write_atomically(path, encode_png(write_labels(sheet, labels)))
     return path
+
+
+def effect_shares(entries: Iterable[dict[str, Any]]) -> dict[str, float]:
+    """Return the share of frames that called for each effect, by its name, the most frequent first.
+
+    Args:
+        entries: of the manifest.
+
+    Source: ours.
+    """
+    counts: Counter[str] = Counter()
+    n_frames = 0
+    for entry in entries:
+        counts.update(entry["effects"])
+        n_frames += 1
+    return {name: n / n_frames for name, n in sorted(counts.items(), key=lambda item: (-item[1], item[0]))}
 
 
 def frame_pictures(frame: dict[str, Tensor]) -> dict[str, np.ndarray]:

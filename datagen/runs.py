@@ -6,13 +6,13 @@ Before: scenes.py, samples.py, writer.py, manifest.py, executors.py, report.py. 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from datagen.executors import run_processes, run_serial
 from datagen.manifest import append_entry, begin_run, locked_folder, write_manifest
 from datagen.progress import Progress
-from datagen.report import write_contact_sheet
+from datagen.report import effect_shares, write_contact_sheet
 from datagen.samples import make_sample
 from datagen.scenes import Plan, survey_assets
 from datagen.spec import DatasetSpec, SpecError
@@ -32,6 +32,7 @@ class RunResult:
     refused: tuple[tuple[str, str], ...]  # (asset, reason)
     contact_sheet: Path | None  # none if no frame is finished
     repaired: tuple[str, ...] = ()  # what an earlier run had listed and was found damaged, a line each
+    effects: dict[str, float] = field(default_factory=dict)  # share of all finished frames that called for each
 
     @property
     def is_complete(self) -> bool:
@@ -93,7 +94,8 @@ def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: boo
         _write_failures(folder, failed, list(roster.refused))
         sheet = write_contact_sheet(folder) if entries else None
     made = len(entries) - kept
-    return RunResult(folder, made, kept, tuple(failed), roster.refused, sheet, tuple(repaired))
+    shares = effect_shares(entries.values())
+    return RunResult(folder, made, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:

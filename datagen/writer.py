@@ -74,6 +74,7 @@ def write_frame(folder: str | Path, index: int, sample: Sample) -> dict[str, Any
         "clip": meta["clip"],
         "frame": meta["frame"],
         "config_sha256": meta["config_sha256"],
+        "effects": [name for name, effect in meta["plan"]["effects"].items() if effect["needed"]],
         "files": files,
     }
 

@@ -83,14 +83,15 @@ def scene(size: int, meshes: list[tb.Mesh], lights: list | None = None) -> tb.Sc
 
 
 def timed(renders: dict[str, Callable[[], tb.Frame]], repeats: int) -> dict[str, tuple[float, tb.Frame]]:
-    """Return the least CPU time of each, and its last frame; they take turns."""
+    """Return the least CPU time of each, and the frame that took it; they take turns."""
     found: dict[str, tuple[float, tb.Frame]] = {}
     for _ in range(repeats):
         for name, render in renders.items():
             start = time.process_time()
             frame = render()
             seconds = time.process_time() - start
-            found[name] = min(seconds, found[name][0] if name in found else seconds), frame
+            if name not in found or seconds < found[name][0]:
+                found[name] = seconds, frame
     return found
 
 

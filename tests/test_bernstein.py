@@ -27,6 +27,15 @@ def found(coefficients, noise=NO_NOISE):
     return sorted(u.tolist())
 
 
+@pytest.mark.parametrize("width", [1, 2, 5])
+def test_length_is_the_norm_however_small_or_large(width, generator):
+    vectors = torch.rand(4, width, 30, dtype=torch.float64, generator=generator) - 0.5
+    expected = torch.linalg.vector_norm(vectors, dim=1)
+    for size in (1.0, 2.0**-600, 2.0**600):
+        torch.testing.assert_close(bernstein.length(size * vectors, 1) / size, expected, rtol=1e-15, atol=0)
+    assert not bernstein.length(0 * vectors, 1).any()
+
+
 def test_value_split_restrict_and_product_are_one_polynomial(generator):
     a = torch.rand(7, 40, dtype=torch.float64, generator=generator) - 0.5
     b = torch.rand(4, 40, dtype=torch.float64, generator=generator) - 0.5

@@ -18,13 +18,18 @@ def vectors(generator, degree, width, spread):
     return middle + spread * (torch.rand(degree + 1, width, N, dtype=FLOAT64, generator=generator) - 0.5)
 
 
-def looks(generator, spread):
-    """Return the dividers, the lookup, and a function of time in [0, 1] (K, N) with the size it is measured by."""
+def looks(generator, spread, moved=None, by=0.0):
+    """Return the dividers, the lookup, and a function of time in [0, 1] (K, N) with the size it is measured by; with
+    one of scale, toward, normal and place `moved` by so much of their sizes, any way.
+    """
     scale = vectors(generator, 2, 1, spread)
     toward, normal = vectors(generator, 3, 3, spread), vectors(generator, 2, 3, spread)
     at_ends = torch.rand(3, 2, N, dtype=FLOAT64, generator=generator)
     place = bernstein.product(scale[[0, 2]] * 0 + 1, at_ends[:2]) * scale  # some way across one texel
     every = torch.arange(N)
+    if moved:
+        at = {"scale": scale, "toward": toward, "normal": normal, "place": place}[moved]
+        at += by * (torch.rand(at.shape, dtype=FLOAT64, generator=torch.Generator().manual_seed(6)) - 0.5)
     limits = (certificate.SCALE_LIMIT, certificate.VECTOR_LIMIT, certificate.VECTOR_LIMIT)
     dividers = [Divider(every, q, limit) for q, limit in zip((scale, toward, normal), limits, strict=True)]
     lookup = Lookup(every, place, scale[:, 0], torch.zeros(N, dtype=torch.bool))
@@ -69,6 +74,32 @@ def test_the_nodes_asked_for_keep_the_tolerance(spread):
     if spread == 0.1:  # two nodes are not enough there: the certificate is not idle
         place, weight = gauss(2)
         assert ((weight * value(place)[0]).sum(0) - true).abs().div(size)[asked].max() > certificate.TOLERANCE
+
+
+@pytest.mark.parametrize("moved", ["scale", "toward", "normal", "place"])
+@pytest.mark.parametrize("spread", [0.0, 0.01, 0.1])
+def test_the_nodes_asked_for_keep_slopes(spread, moved):
+    """Central differences of the error; at spread 0 only slopes vary with time, for which one node is not enough."""
+    panels = torch.arange(N), torch.zeros(N, dtype=FLOAT64), torch.ones(N, dtype=FLOAT64)
+    step = 1e-4
+    (dividers, lookup, value), forth, back = (
+        looks(torch.Generator().manual_seed(5), spread, moved, by) for by in (0.0, step, -step)
+    )
+    size = 2 * value(gauss(40)[0])[1].amax(0)
+
+    def errors(n):
+        means = [[(w * f(t)[0]).sum(0) for t, w in (gauss(n), gauss(40))] for f in (forth[2], back[2])]
+        return ((means[0][0] - means[0][1]) - (means[1][0] - means[1][1])).abs() / (2 * step) / size
+
+    needed = certificate.nodes_needed(dividers, lookup, panels, N, slopes=True).ceil().clamp(min=1)
+    asked = needed <= 16
+    assert asked.sum() > N / 100
+    for n in torch.unique(needed[asked]).long().tolist():
+        assert errors(n)[asked & (needed == n)].max() <= 10 * certificate.TOLERANCE
+    without = certificate.nodes_needed(dividers, lookup, panels, N).ceil().clamp(min=1)
+    assert (without <= needed).all()
+    if spread == 0.0:
+        assert max(errors(n)[without == n].max() for n in torch.unique(without).long().tolist()) > 1e-3
 
 
 def test_a_place_that_bends_while_the_scale_rests_counts():

@@ -7,10 +7,11 @@ import pytest
 from test_datagen_runs import command
 
 import datagen.runs
-from datagen import MeshError, generate, parse_spec
+from datagen import BlurDataset, MeshError, generate, parse_spec
 from datagen.__main__ import main
 from datagen.executors import MAX_TRIES, run_processes, run_serial
 from datagen.manifest import read_manifest
+from datagen.report import effect_shares
 
 
 def task_that_fails_at_2(plan, folder, index):
@@ -65,6 +66,24 @@ def test_a_failing_frame_gives_exit_code_1_and_is_made_by_a_rerun(tmp_path, monk
     assert main(words) == 0
     assert not (tmp_path / "data/failures.json").exists()
     assert list(read_manifest(tmp_path / "data")) == [0, 1, 2]
+
+
+def test_the_summary_tells_what_share_of_the_frames_called_for_what(tmp_path, capsys):
+    """Also of those that an earlier run made."""
+    out = tmp_path / "data"
+    assert main(command(out, count=2, workers=1)) == 0
+    assert main(command(out, count=5, workers=1)) == 0
+    needed = [
+        {name for name, effect in BlurDataset(out).metadata(k)["plan"]["effects"].items() if effect["needed"]}
+        for k in range(5)
+    ]
+    assert any(needed)
+    line = next(line for line in capsys.readouterr().out.splitlines()[::-1] if line.startswith("effects"))
+    told = dict(part.rsplit(" ", 1) for part in line.split(": ")[1].split(", "))
+    assert told == {name: f"{20 * sum(name in each for each in needed)}%" for name in set().union(*needed)}
+    shares = effect_shares([{"effects": ["motion"]}, {"effects": ["texture", "motion"]}, {"effects": []}])
+    assert list(shares.items()) == [("motion", 2 / 3), ("texture", 1 / 3)]
+    assert effect_shares([]) == {}
 
 
 def test_bad_assets_give_exit_code_1_and_are_listed(tmp_path, capsys):

@@ -89,10 +89,10 @@ def sheet(z=0.0, shift=None, x=(-0.5, 0.5), **options) -> tb.Mesh:
     return shape(*corners.tolist(), end=None if shift is None else [corners + shift], **options)
 
 
-def approaching(*depths, x=0.0, **options) -> tb.Mesh:
-    """Return a triangle whose depth goes through `depths` at equal times."""
-    corners = [np.array([[x - 0.4, -0.4, z], [x + 0.4, -0.4, z], [x, 0.4, z]]) for z in depths]
-    return shape(*corners[0].tolist(), end=[c.tolist() for c in corners[1:]], **options)
+def approaching(*depths, x=0.0, tilt=0.0, **options) -> tb.Mesh:
+    """Return a triangle, perhaps tilted, whose depth goes through `depths` at equal times."""
+    corners = [np.array([[x - 0.4, -0.4, z], [x + 0.4, -0.4, z], [x, 0.4, z + tilt]]) for z in depths]
+    return shape(*corners[0].tolist(), end=[c.tolist() for c in corners[1:]] or None, **options)
 
 
 def turning(**options) -> tb.Mesh:
@@ -114,6 +114,11 @@ TRUTH = {
     "a sheet at rest": ([sheet()], ""),
     "knots that are equal": ([sheet(shift=[0.0, 0, 0])], ""),
     "sheets at rest one behind the other": ([sheet(0.0), sheet(0.5), sheet(-0.5)], ""),
+    "sheets at rest that pass through each other": ([approaching(0.0, tilt=0.5), sheet(0.1)], ""),
+    "the same beside one that moves": (
+        [approaching(0.0, tilt=0.5), sheet(0.1, x=(-0.4, 0.4)), sheet(0.0, [0.1, 0, 0], (-0.9, -0.7))],
+        "motion",
+    ),
     "a sheet that moves": ([sheet(shift=[0.4, 0, 0])], "motion"),
     "one that barely moves": ([sheet(shift=[ULP, 0, 0])], "motion"),
     "one that moves before one at rest": ([sheet(shift=[0.4, 0, 0]), sheet(0.5)], "motion"),
@@ -216,10 +221,11 @@ def test_what_is_hidden_is_not_solved():
     assert auto.counts["hidden_pairs"] > 0.3 * everything.counts["pairs"]
 
 
-def test_gradients_are_the_same():
+@pytest.mark.parametrize("look", ["faces", "lit"])
+def test_gradients_are_the_same(look):
     bodies = (
         Body("wall", (0, 0, -3), "still", "texture", 1.0, True),
-        Body("box", (0, 0, 0), "shift", "faces", 1.0, True),
+        Body("box", (0, 0, 0), "shift", look, 1.0, True),
     )
     grads = []
     for effects in ("auto", "all"):
@@ -232,7 +238,7 @@ def test_gradients_are_the_same():
         grads.append(torch.autograd.grad((rgba * weight).sum(), leaves))
     for a, b in zip(*grads, strict=True):
         assert float(a.abs().max()) > 0
-        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9)
+        torch.testing.assert_close(a, b, rtol=1e-9, atol=1e-9 if look == "faces" else 1e-5)  # by nodes: certified
 
 
 def test_knots_that_ask_for_gradients_move():

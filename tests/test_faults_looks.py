@@ -11,6 +11,7 @@ import lit_scenes as lit
 import numpy as np
 import pytest
 import scene_makers as make
+import test_gradients_of_looks
 import test_lighting
 import test_mipmap
 import test_misprints
@@ -138,9 +139,21 @@ def plant_light_bends_ignored(patch):
     patch.setattr(light_bends.LightPaths, "bends", lambda self, _: (self.paths.span[:0], self.paths.t[0, :0]))
 
 
+def plant_nodes_for_values_alone(patch):
+    patch.setattr(nodes, "_asks_for_slopes", lambda prisms: False)
+
+
+def plant_knots_that_move_with_their_cell(patch):
+    def all_move(cells, varying):
+        start, end = cells.t_start[varying.cell], cells.t_end[varying.cell]
+        return tuple((1 - s) * start + s * end for s in (varying.start, varying.end))
+
+    patch.setattr(nodes, "_span_ends", all_move)
+
+
 def plant_too_few_nodes(patch):
     patch.setattr(nodes, "COUNTS", (1,))
-    patch.setattr(nodes, "nodes_needed", lambda dividers, lookup, panels, _: torch.ones_like(panels[1]))
+    patch.setattr(nodes, "nodes_needed", lambda dividers, lookup, panels, *_: torch.ones_like(panels[1]))
 
 
 def plant_chord_of_view_depth(patch):
@@ -274,6 +287,8 @@ FAULTS = {
     plant_texture_bends_ignored: test_texture.test_a_sliding_texture_is_the_mean_over_its_path,
     plant_level_bends_ignored: lambda: test_level_alone_changes(),
     plant_light_bends_ignored: test_lighting.test_hard_spot_border_passes_in_mid_exposure,
+    plant_nodes_for_values_alone: lambda: test_gradients_of_looks.test_vertices_of_lit_faces("shift", "spot"),
+    plant_knots_that_move_with_their_cell: lambda: test_gradients_of_looks.test_windows("lit"),
     plant_too_few_nodes: test_lighting.test_light_moves_over_a_still_plate,
     plant_chord_of_view_depth: (
         lambda: test_subdivide.test_the_papers_planes_change_places_when_each_accuracy_says(3.0)

@@ -8,7 +8,7 @@ Source: Farouki & Rajan 1987 (arithmetic); Lane & Riesenfeld 1981 (roots by subd
 
 from __future__ import annotations
 
-from functools import cache
+from functools import cache, reduce
 from math import comb
 
 import torch
@@ -36,6 +36,11 @@ def product(a: Tensor, b: Tensor) -> Tensor:
             term = weights[i][j] * (a[i] * b[j])
             rows[i + j] = term if rows[i + j] is None else rows[i + j] + term
     return torch.stack(rows)
+
+
+def length(vectors: Tensor, dim: int) -> Tensor:
+    """Return the lengths of vectors along `dim`, many times faster than torch's norm; where they are 0, no gradient."""
+    return reduce(torch.hypot, vectors.unbind(dim)).abs()
 
 
 def value(coefficients: Tensor, u: Tensor) -> Tensor:

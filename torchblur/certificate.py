@@ -10,6 +10,10 @@ most set shares of their |c_0|, looks are analytic inside; there a place leaves 
 |S_0|, a bilinear lookup grows to at most (1 + D_x) (1 + D_y) times its contrast, a shutter's weight to 1 + rho / 2
 times, and what light and mip levels do to at most GROWTH times. Gauss's rule with n nodes then errs by at most
 64 / 15 / 2 of the product of these, times rho^(-2 n) / (1 - rho^-2) (Trefethen, theorem 19.3).
+
+A slope of the integral, for gradients, is the integral of a look's slope by some q or X times how that moves: any
+polynomial of its degree d, which on the ellipse is at most rho^d times what it is on the panel (Bernstein and Walsh).
+So light that rests on a sliding face takes one node, and its slope more. Slopes by q itself are some ten times looks.
 Source: Trefethen 2013, Approximation Theory and Approximation Practice; its use here: ours.
 """
 
@@ -56,7 +60,7 @@ class Lookup:
 
 
 def nodes_needed(
-    dividers: list[Divider], lookup: Lookup, panels: tuple[Tensor, Tensor, Tensor], n_spans: int
+    dividers: list[Divider], lookup: Lookup, panels: tuple[Tensor, Tensor, Tensor], n_spans: int, slopes: bool = False
 ) -> Tensor:
     """Return how many nodes (p,) bring each panel below the tolerance; infinite where none are certain to.
 
@@ -65,16 +69,20 @@ def nodes_needed(
         lookup: all places of the spans.
         panels: span, start and end (p,) of each, as shares of the span.
         n_spans: number of spans.
+        slopes: whether gradients too shall be right, to ten times the tolerance for a q or X that moves by its size.
 
     Source: Trefethen 2013, theorem 19.3; ours.
     """
     _, start, end = panels
     sized = []
+    degree = torch.zeros_like(start)  # of how what is looked at may move
     for divider in dividers:
         index, of = _on_panels(divider.span, panels, n_spans)
-        q = _chebyshev(bernstein.restrict(divider.q[..., index], start[of], end[of])).norm(dim=1)
+        q = _chebyshev(bernstein.restrict(divider.q[..., index], start[of], end[of]))
+        q = bernstein.length(q, 1)
         limit = divider.limit(index, 0.5 * (start + end)[of]) if callable(divider.limit) else divider.limit
         sized.append((of, _significant(q, q[0]), limit))
+        degree[of] = degree[of].clamp(min=len(q) - 1)
     index, of = _on_panels(lookup.span, panels, n_spans)
     scale, place = (
         _chebyshev(bernstein.restrict(c[..., index], start[of], end[of])) for c in (lookup.scale, lookup.place)
@@ -83,6 +91,7 @@ def nodes_needed(
     ratio = place[0] / middle
     away = _significant((place - ratio * scale.unsqueeze(1)).abs(), place.abs().amax(0))
     multiplies = lookup.multiplies[index]
+    degree[of] = degree[of].clamp(min=len(scale) - 1)
     needed = torch.full_like(start, torch.inf)
     for rho in RHO:
         fits = torch.ones_like(start, dtype=torch.bool)
@@ -91,6 +100,7 @@ def nodes_needed(
         grown = torch.log1p(2 * _tail(away, rho) / middle.abs()).sum(0)
         growth = torch.zeros_like(start).scatter_reduce(0, of[~multiplies], grown[~multiplies], "amax")
         growth = growth.index_add(0, of[multiplies], grown[multiplies]) + math.log1p(rho / 2)
+        growth = growth + degree * math.log(rho) if slopes else growth
         bound = growth + math.log(64 / 15 / 2 * GROWTH / (1 - rho**-2) / TOLERANCE)
         needed = torch.where(fits, torch.minimum(needed, bound / (2 * math.log(rho))), needed)
     return needed

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchblur import check
+from torchblur import bernstein, check
 from torchblur.accuracy import Accuracy
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.scene import Scene
@@ -133,8 +133,10 @@ def plan_effects(
 def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, rays_per_pixel: int) -> EffectPlan:
     """Return the plan of a scene whose prisms and their survey are `seen`. Source: ours."""
     away = shows_back(seen[0], seen[1].facing)
-    chosen = (~away).nonzero().flatten()
-    prisms, survey = (part.choose(chosen) for part in seen)
+    prisms, survey = seen
+    if away.any():
+        chosen = (~away).nonzero().flatten()
+        prisms, survey = prisms.choose(chosen), survey.choose(chosen)
     surfaces = prisms.surfaces
     textures = [mesh.material.texture for mesh in scene.meshes]
     opacity = []
@@ -160,10 +162,10 @@ def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, r
 def _motion(scene: Scene, prisms: Prisms, survey: Survey) -> Effect:
     moving = ~survey.is_still
     n_moving, n_segments = int(moving.sum()), len(torch.unique(prisms.t_open))
-    path = (prisms.corners_px[:, 3:] - prisms.corners_px[:, :3]).norm(dim=0)[:, moving].nan_to_num(0.0)
     if n_moving == 0:
         why = f"all {prisms.count:,} faces in view rest"
     else:
+        path = bernstein.length(prisms.corners_px[:, 3:] - prisms.corners_px[:, :3], 0)[:, moving].nan_to_num(0.0)
         why = f"{n_moving:,} of {prisms.count:,} prisms move, by up to {float(path.max()):.3g} px"
         why += f", in up to {n_segments} slices of time" if n_segments > 1 else ""
     width, height = scene.camera.width, scene.camera.height

@@ -115,7 +115,7 @@ class LightPaths:
 def _cone_limit(light: SpotLight, vector: Tensor, axis: Tensor, which: Tensor, tau: Tensor) -> Tensor:
     """Return by what share (n,) vectors to a spot may vary about the times `tau` of the paths `which` (n,)."""
     v, a = (bernstein.value(c[..., which], tau) for c in (vector, axis))
-    size = v.norm(dim=0) * a.norm(dim=0)
+    size = bernstein.length(v, 0) * bernstein.length(a, 0)
     cosine = (v * a).sum(0).abs() / torch.where(size > 0, size, 1.0)  # V may have the sign of -S
     inner, outer = light.cosines
     limit = torch.full_like(cosine, VECTOR_LIMIT)

@@ -24,7 +24,7 @@ from torchblur.light_bends import LightPaths
 from torchblur.paths import Paths, cut_spans, follow
 from torchblur.prisms import Prisms
 from torchblur.shadows import Shadows, find_shadows
-from torchblur.sort import argsort_by, between
+from torchblur.sort import SAME_TIME, argsort_by, between
 from torchblur.surfaces import Surfaces
 from torchblur.texture_bends import TexturePaths
 
@@ -44,7 +44,7 @@ class Samples:
 
     cell: Tensor  # (S,) int64
     t: Tensor  # (S,) float64 shutter time
-    share: Tensor  # (S,) float64 of the cell's length that the sample stands for
+    length: Tensor  # (S,) float64 shutter time that the sample stands for
     is_flat: Tensor  # (S,) bool: stands for its whole cell, in which nothing changes
     span: Tensor  # (S,) int64 the span in which it lies; 0 where flat
     tau: Tensor  # (S,) float64 share of the span
@@ -86,7 +86,8 @@ def middle_samples(cells: Cells) -> Samples:
     every = torch.arange(len(cells.t_start), device=cells.t_start.device)
     middle = 0.5 * (cells.t_start + cells.t_end)
     one = torch.ones_like(middle)
-    return Samples(every, middle, one, torch.ones_like(every, dtype=torch.bool), torch.zeros_like(every), 0.5 * one)
+    is_flat = torch.ones_like(every, dtype=torch.bool)
+    return Samples(every, middle, cells.t_end - cells.t_start, is_flat, torch.zeros_like(every), 0.5 * one)
 
 
 @torch.no_grad()
@@ -182,6 +183,8 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
         varying: of `find_varying`.
 
     Accuracy: certificate.TOLERANCE, certified.
+    Gradient: of times and lengths to the cells' ends. A knot, which cuts a cell at a fixed time, does not move with
+        them, nor does the edge of a shadow; bends may, since there looks only bend.
     Source: Gauss-Legendre quadrature; ours.
     """
     if varying is None:
@@ -189,30 +192,56 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
     device = cells.t_start.device
     panels = _cut_panels(prisms, varying)
     owner, start, end, n_nodes = _count_nodes(prisms, varying, panels)
-    owners, taus, shares = [], [], []
+    parts = [], [], []
     for n in COUNTS:
         chosen = (n_nodes == n).nonzero().flatten()
-        place, weight = (torch.as_tensor(a, device=device) for a in _gauss(n))
-        length = (end - start)[chosen]
-        owners.append(owner[chosen].repeat(n))
-        taus.append((start[chosen] + length * (0.5 * (place.unsqueeze(1) + 1))).flatten())
-        shares.append((length * (0.5 * weight.unsqueeze(1))).flatten())
-    span, within, share = torch.cat(owners), torch.cat(taus), torch.cat(shares)
-    length = varying.end - varying.start
-    is_varying = torch.zeros(len(cells.t_start), dtype=torch.bool, device=device)
-    is_varying[varying.cell] = True
-    rest = (~is_varying).nonzero().flatten()
-    one = torch.ones(len(rest), dtype=torch.float64, device=device)
-    owner = torch.cat([varying.cell[span], rest])
-    tau = torch.cat([varying.start[span] + within * length[span], 0.5 * one])
-    share = torch.cat([share * length[span], one])
-    order = argsort_by(owner, tau)
-    within = torch.cat([within, 0.5 * one])[order]
-    span = torch.cat([span, torch.zeros_like(rest)])[order]
-    owner, tau, share = owner[order], tau[order], share[order]
+        place, weight = (torch.as_tensor(a, device=device).unsqueeze(1) for a in _gauss(n))
+        zero = torch.zeros_like(start[chosen])
+        for values, more in zip(parts, (chosen, 0.5 * (place + 1) + zero, 0.5 * weight + zero), strict=True):
+            values.append(more.expand(n, len(chosen)).flatten())
+    panel, within, share = (torch.cat(values) for values in parts)
+    is_flat = torch.ones(len(cells.t_start), dtype=torch.bool, device=device)
+    is_flat[varying.cell] = False
+    rest = is_flat.nonzero().flatten()
+    half = torch.full((len(rest),), 0.5, dtype=torch.float64, device=device)
+    span = torch.cat([owner[panel], torch.zeros_like(rest)])
+    owner_cell = torch.cat([varying.cell[owner[panel]], rest])
+    tau = torch.cat([start[panel] + within * (end - start)[panel], half])
+    within, share = torch.cat([within, half]), torch.cat([share, 2 * half])
     with torch.enable_grad():
-        t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
-    return Samples(owner, t, share, ~is_varying[owner], span, within)
+        ends = _panel_ends(cells, varying, (owner, start, end))
+        first, last = (torch.cat([e[panel], c[rest]]) for e, c in zip(ends, (cells.t_start, cells.t_end), strict=True))
+        t, length = (1 - within) * first + within * last, share * (last - first)
+        order = argsort_by(owner_cell, t.detach())
+        found = (owner_cell, t, length, is_flat[owner_cell], span, tau)
+        return Samples(*(part[order] for part in found))
+
+
+def _panel_ends(cells: Cells, varying: Varying, panels: tuple[Tensor, Tensor, Tensor]) -> list[Tensor]:
+    """Return the shutter times (p,) at which panels (span, start, end) start and end; inside a span on which shadows
+    fall they do not move with the cell, as what they part is not the same.
+    """
+    span, *shares = panels
+    first, last = (end[span] for end in _span_ends(cells, varying))
+    ends = []
+    for share in shares:
+        t = (1 - share) * first + share * last
+        ends.append(t if varying.shadows is None else torch.where((share > 0) & (share < 1), t.detach(), t))
+    return ends
+
+
+def _span_ends(cells: Cells, varying: Varying) -> tuple[Tensor, Tensor]:
+    """Return the shutter times (n,) at which spans start and end, moving where these are the cell's own ends."""
+    t_start, t_end = cells.t_start[varying.cell], cells.t_end[varying.cell]
+    start, end = ((1 - s) * t_start.detach() + s * t_end.detach() for s in (varying.start, varying.end))
+    is_first, is_last = varying.start <= SAME_TIME, varying.end >= 1 - SAME_TIME  # as spans so short are left out
+    return torch.where(is_first, t_start, start), torch.where(is_last, t_end, end)
+
+
+def _asks_for_slopes(prisms: Prisms) -> bool:
+    """Return whether what looks follow in time asks for gradients."""
+    lights = [tensor for light in prisms.surfaces.lights for tensor in light.tensors().values()]
+    return any(x.requires_grad for x in (prisms.clip, prisms.world, prisms.normal, prisms.surfaces.uv, *lights))
 
 
 @cache
@@ -254,13 +283,13 @@ def _count_nodes(
     prisms: Prisms, varying: Varying, panels: tuple[Tensor, Tensor, Tensor]
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Return panels, halved where necessary, and their numbers of nodes (p,)."""
-    n_spans = len(varying.cell)
+    n_spans, slopes = len(varying.cell), _asks_for_slopes(prisms)
     dividers, lookup = _dividers(prisms, varying), varying.textured.finest_lookup(prisms)
     counts = torch.tensor([*COUNTS, COUNTS[-1]], device=varying.start.device)
     done = []
     for k in range(MAX_HALVINGS + 1):
         span, start, end = panels
-        needed = nodes_needed(dividers, lookup, panels, n_spans)
+        needed = nodes_needed(dividers, lookup, panels, n_spans, slopes)
         place = torch.searchsorted(counts[:-1].to(needed.dtype), needed)
         is_ready = place < len(COUNTS)
         if k >= FREE_HALVINGS:

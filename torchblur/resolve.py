@@ -108,7 +108,7 @@ def weigh_samples(shutter: Shutter, cells: Cells, samples: Samples, line: Tensor
     whole = shutter.weight(start, end, line)
     if samples.is_flat.all():
         return whole
-    return torch.where(samples.is_flat, whole, (end - start) * samples.share * shutter.density(samples.t, line))
+    return torch.where(samples.is_flat, whole, samples.length * shutter.density(samples.t, line))
 
 
 def expose_samples(offsets: Tensor, composite: Composite, weight: Tensor, n_meshes: int) -> Resolved:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from torchblur import packed
+from torchblur import bernstein, packed
 from torchblur.prisms import Prisms
 
 NOISE = 1e-13  # of the product of the corners' sizes: smaller D may be rounding
@@ -45,13 +45,18 @@ def survey_prisms(prisms: Prisms, size_px: tuple[int, int]) -> Survey:
     rests = (prisms.clip[0] == prisms.clip[1]).all(0).all(0)
     whole = (prisms.t_open == start) & (prisms.t_close == end)
     nearness, facing = _nearness_range(prisms), _facing(prisms)
-    seen = (~shows_back(prisms, facing)).nonzero().flatten()
+    away = shows_back(prisms, facing)
+    is_still = rests & whole & ~prisms.is_clipped
+    seen = (prisms, nearness, ~is_still)
+    if away.any():
+        chosen = (~away).nonzero().flatten()
+        seen = (prisms.choose(chosen), nearness[:, chosen], ~is_still[chosen])
     return Survey(
-        is_still=rests & whole & ~prisms.is_clipped,
+        is_still=is_still,
         hides=prisms.surfaces.is_opaque[prisms.face_of],
         facing=facing,
         nearness=nearness,
-        may_cross=_may_cross(prisms.choose(seen), nearness[:, seen], size_px),
+        may_cross=_may_cross(*seen, size_px),
     )
 
 
@@ -74,22 +79,23 @@ def _facing(prisms: Prisms) -> Tensor:
     """Return (P,) int8 the side that is seen: D keeps its sign where its Bernstein coefficients have one."""
     a, b = prisms.clip[:, :, [0, 1, 3]]  # (3 corners, x y w, P)
     rows = torch.zeros_like(a[0, 0].expand(4, -1))
-    for ends in range(8):  # the blossom: each corner from either end
-        at = [b[i] if ends >> i & 1 else a[i] for i in range(3)]
-        k = ends.bit_count()
-        rows[k] += (at[0] * torch.linalg.cross(at[1], at[2], dim=0)).sum(0) / (1, 3, 3, 1)[k]
-    size = torch.maximum(a.norm(dim=1), b.norm(dim=1)).prod(0)
+    for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)):  # the blossom: each corner from either end
+        across = torch.linalg.cross((a, b)[i][1], (a, b)[j][2], dim=0)
+        for end, corner in enumerate((a[0], b[0])):
+            k = i + j + end
+            rows[k] += (corner * across).sum(0) / (1, 3, 3, 1)[k]
+    size = torch.maximum(bernstein.length(a, 1), bernstein.length(b, 1)).prod(0)
     rows = rows * prisms.parity
     sure = (rows > NOISE * size).all(0).to(torch.int8) - (rows < -NOISE * size).all(0).to(torch.int8)
     return torch.where(prisms.is_clipped, 0, sure)
 
 
-def _may_cross(prisms: Prisms, nearness: Tensor, size_px: tuple[int, int]) -> bool:
-    """Return whether the nearness of two prisms overlaps in one tile of the screen and slice of time.
+def _may_cross(prisms: Prisms, nearness: Tensor, moves: Tensor, size_px: tuple[int, int]) -> bool:
+    """Return whether the nearness of two prisms overlaps in a tile of the screen and slice of time in which one moves.
 
     Ranges that only touch keep their order: those of faces in one plane at rest in depth, or one in front of another.
     """
-    if prisms.count < 2:
+    if prisms.count < 2 or not moves.any():
         return False
     knots = torch.unique(torch.cat([prisms.t_open, prisms.t_close]))
     slices = [torch.searchsorted(knots, t) for t in (prisms.t_open, prisms.t_close)]
@@ -107,6 +113,10 @@ def _may_cross(prisms: Prisms, nearness: Tensor, size_px: tuple[int, int]) -> bo
     row = first[1, of] + index // spans[0, of] % spans[1, of]
     time = slices[0][of] + index // (spans[0] * spans[1])[of]
     place = (time * n + row) * n + column
+    is_lively = torch.zeros((len(knots) - 1) * n * n, dtype=torch.bool, device=knots.device)
+    is_lively[place[moves[of]]] = True
+    lively = is_lively[place].nonzero().flatten()
+    place, of = place[lively], of[lively]
     order = torch.sort(nearness[0, of], stable=True).indices
     order = order[torch.sort(place[order], stable=True).indices]
     place, (least, greatest) = place[order], nearness[:, of[order]]

@@ -202,6 +202,25 @@ def test_hong2018_makes_two_triangles_of_edges_that_cross_and_four_of_others():
         assert len(patches.prism) == 14 - 2 * n_crossing
 
 
+def test_hong2018_splits_crossing_edges_where_they_cross_on_screen():
+    """In perspective, and with the surface closed: a ray enters the prism as often as it leaves it."""
+    angle = 0.3
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    blade = np.array([[-0.8, -0.3, -0.5], [0.9, -0.25, 0.3], [0.85, 0.3, 0.2], [-0.8, 0.35, -0.4]])
+    lamp = lit.spot((0, 0, 4), (0, 0, 0), 9.0, (20, 30))
+    plain = LookScene([LookMesh(np.stack([blade, blade @ turn.T]), TWO)], lit.UPRIGHT, 8, 8, lights=[lamp])
+    scene = lit.to_torch(plain)
+    moving = gather_faces(scene)
+    views = view_from_light(scene, moving, 128)
+    prisms = views.project(moving.world)[0]
+    patches = build_patches(prisms)
+    assert len(patches.prism) < 2 * 14
+    found = rasterise(views, patches.corners, torch.zeros(len(patches.prism), dtype=torch.int64))
+    count = torch.bincount(found.texel * 2 + patches.prism[found.triangle])
+    assert count.max() >= 2
+    assert (count % 2 == 0).all()
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_hong2018_drops_faces_whose_back_is_to_the_light(turned):
     plate = np.array([[-1.0, 0, 1], [1, 0, 1], [1.1, 0, -1], [-1, 0, -1.2]])

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
+import json
+import sys
+from pathlib import Path
 
 import lit_scenes as lit
 import numpy as np
@@ -293,3 +297,21 @@ def test_what_the_methods_cannot_do_is_refused():
         render_tsm(scene, n_layers=2, **(options | {"size_px": 0}))
     with pytest.raises(ValueError, match="bias: expected"):
         render_tsm(scene, n_layers=2, **(options | {"bias": -1.0}))
+
+
+def test_the_comparison_finds_the_exact_shadows_closest(tmp_path, monkeypatch, capsys):
+    path = Path(__file__).resolve().parent.parent / "scripts" / "shadow_comparison.py"
+    spec = importlib.util.spec_from_file_location("shadow_comparison", path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    for name, value in (("MAP_SIZE_PX", 128), ("COUNTS", (4,))):
+        monkeypatch.setattr(script, name, value)
+    monkeypatch.setattr(script.torch, "set_num_threads", lambda n: None)
+    monkeypatch.setattr(sys, "argv", ["shadow_comparison.py", "--quick", "--size", "20", "--out", str(tmp_path)])
+    script.main()
+    found = json.loads((tmp_path / "shadow_comparison.json").read_text(encoding="utf-8"))["methods"]
+    off = {name: numbers["visibility_rmse"] for name, numbers in found.items()}
+    assert min(off, key=off.get) == "torchblur"
+    assert off["torchblur"] < 0.005 < 0.02 < off["hong2018, 4 samples"] < off["tsm, 4 layers"]
+    assert capsys.readouterr().out.count("\n| ") == len(found) + 1
+    assert (tmp_path / "shadow_comparison.png").stat().st_size > 2_000

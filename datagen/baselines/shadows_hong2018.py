@@ -88,7 +88,7 @@ def render_hong2018(
         n_samples: of a pixel.
         size_px: texels along each side of the map (of each of the six of a point light).
         bias: by how much a range must be nearer to the light than a point to shade it [scene units].
-        generator: gives the times.
+        generator: on the CPU, gives the times.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.

@@ -38,7 +38,7 @@ def render_tsm(
         n_layers: strata of the exposure.
         size_px: texels along each side of a map (of each of the six of a point light).
         bias: by how much a texel must be nearer to the light than a point to shade it [scene units].
-        generator: gives the times.
+        generator: on the CPU, gives the times.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.

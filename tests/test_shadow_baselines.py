@@ -79,6 +79,23 @@ def test_shadow_rays_are_those_of_the_oracle(kind):
     assert got.visibility.numpy() == pytest.approx(want.visibility, abs=1e-12)
 
 
+def test_shadow_rays_meet_backs_that_are_not_shown_and_nothing_beyond_the_light():
+    roof = np.array([[-3.0, 1.4, 2], [2, 1.4, 2], [2, 1.4, -2], [-3, 1.6, -2]])
+    above = roof + np.array([0, 5, 0])
+    shown, hidden = np.array(TWO), np.array(TWO)[:, ::-1]  # to the camera above
+    over = np.stack([roof, roof * np.array([1, -0.6, 1]) + np.array([0, 1.8, 0]), roof - np.array([0, 0.2, 3])])
+    over[1, :, 0] *= -1  # turns over on the way, one side is shown
+    extras = (roof, hidden, 0.1), (above, shown, 0.0), (over, shown, 0.02)
+    for corners, faces, least_shadow in extras:
+        base = ball_over_floor(LAMPS["point"], size=24)
+        extra = LookMesh(corners, faces, double_sided=False, color=(0.2, 0.9, 0.3))
+        plain = dataclasses.replace(base, meshes=[*base.meshes, extra])
+        got, want = trace_shadows(lit.to_torch(plain), n_subframes=6), mean_with_shadows(plain, midpoints(6))
+        assert (want.visibility < 0.5).mean() > least_shadow
+        assert want.visibility.max() == 1
+        assert got.rgba.numpy() == pytest.approx(want.rgba, abs=1e-12)
+
+
 @pytest.mark.parametrize("name", ["spinning_box", "smooth_ball"])
 def test_shadow_rays_on_turning_bodies(name):
     plain = lit.SCENES[name]()

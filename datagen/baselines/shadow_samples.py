@@ -39,11 +39,11 @@ class MovingFaces:
     is_lit: Tensor  # (S,) bool
     is_one_sided: Tensor  # (S,) bool
 
-    def world_at(self, t: float) -> tuple[Tensor, Tensor]:
-        """Return the corners (F, 3, 3) of the faces at a shutter time, and which faces (F,) these are."""
+    def world_at(self, t: float) -> Tensor:
+        """Return the corners (F, 3, 3) of the faces at a shutter time."""
         now = ((self.t_open <= t) & (t < self.t_close) | (self.t_close == t) & (t == 1)).nonzero().flatten()
         u = ((t - self.t_open) / (self.t_close - self.t_open))[now].reshape(-1, 1, 1)
-        return (1 - u) * self.world[0, now] + u * self.world[1, now], self.face[now]
+        return (1 - u) * self.world[0, now] + u * self.world[1, now]
 
 
 @dataclass(frozen=True, eq=False)

@@ -95,6 +95,14 @@ def test_a_plane_that_rises_towards_the_light_never_shades_itself():
         assert (mean_with_shadows(seen_from_above([plane], [lamp], n=24), midpoints(5)).visibility == 1).all()
 
 
+def test_a_face_never_shades_itself_whatever_the_tolerance():
+    corners = np.array([[-5.3, -5.1, -0.9], [5.1, -4.9, -0.35], [5.2, 6.3, -0.41], [-4.7, 5.9, -0.83]])
+    one_face = LookMesh(corners, [[0, 1, 2]])
+    for lamp in (lit.point((0.3, 0.1, 4), 9.0), lit.sun((0.3, 0.2, -1))):
+        scene = seen_from_above([one_face], [lamp], n=24)
+        assert (instant_with_shadows(scene, 0.5, tolerance=0.0).visibility == 1).all()
+
+
 def test_no_light_is_due_on_what_is_unlit_or_turned_away():
     scene = seen_from_above([floor(shading="unlit"), hidden(slab(-1, 1))], [lit.sun((0, 0, -1))])
     answer = instant_with_shadows(scene, 0.5)

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
+import json
+import sys
+from pathlib import Path
 
 import lit_scenes as lit
 import numpy as np
@@ -73,6 +77,23 @@ def test_shadow_rays_are_those_of_the_oracle(kind):
     assert want.visibility.min() < 0.5
     assert got.rgba.numpy() == pytest.approx(want.rgba, abs=1e-12)
     assert got.visibility.numpy() == pytest.approx(want.visibility, abs=1e-12)
+
+
+def test_shadow_rays_meet_backs_that_are_not_shown_and_nothing_beyond_the_light():
+    roof = np.array([[-3.0, 1.4, 2], [2, 1.4, 2], [2, 1.4, -2], [-3, 1.6, -2]])
+    above = roof + np.array([0, 5, 0])
+    shown, hidden = np.array(TWO), np.array(TWO)[:, ::-1]  # to the camera above
+    over = np.stack([roof, roof * np.array([1, -0.6, 1]) + np.array([0, 1.8, 0]), roof - np.array([0, 0.2, 3])])
+    over[1, :, 0] *= -1  # turns over on the way, one side is shown
+    extras = (roof, hidden, 0.1), (above, shown, 0.0), (over, shown, 0.02)
+    for corners, faces, least_shadow in extras:
+        base = ball_over_floor(LAMPS["point"], size=24)
+        extra = LookMesh(corners, faces, double_sided=False, color=(0.2, 0.9, 0.3))
+        plain = dataclasses.replace(base, meshes=[*base.meshes, extra])
+        got, want = trace_shadows(lit.to_torch(plain), n_subframes=6), mean_with_shadows(plain, midpoints(6))
+        assert (want.visibility < 0.5).mean() > least_shadow
+        assert want.visibility.max() == 1
+        assert got.rgba.numpy() == pytest.approx(want.rgba, abs=1e-12)
 
 
 @pytest.mark.parametrize("name", ["spinning_box", "smooth_ball"])
@@ -202,6 +223,25 @@ def test_hong2018_makes_two_triangles_of_edges_that_cross_and_four_of_others():
         assert len(patches.prism) == 14 - 2 * n_crossing
 
 
+def test_hong2018_splits_crossing_edges_where_they_cross_on_screen():
+    """In perspective, and with the surface closed: a ray enters the prism as often as it leaves it."""
+    angle = 0.3
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    blade = np.array([[-0.8, -0.3, -0.5], [0.9, -0.25, 0.3], [0.85, 0.3, 0.2], [-0.8, 0.35, -0.4]])
+    lamp = lit.spot((0, 0, 4), (0, 0, 0), 9.0, (20, 30))
+    plain = LookScene([LookMesh(np.stack([blade, blade @ turn.T]), TWO)], lit.UPRIGHT, 8, 8, lights=[lamp])
+    scene = lit.to_torch(plain)
+    moving = gather_faces(scene)
+    views = view_from_light(scene, moving, 128)
+    prisms = views.project(moving.world)[0]
+    patches = build_patches(prisms)
+    assert len(patches.prism) < 2 * 14
+    found = rasterise(views, patches.corners, torch.zeros(len(patches.prism), dtype=torch.int64))
+    count = torch.bincount(found.texel * 2 + patches.prism[found.triangle])
+    assert count.max() >= 2
+    assert (count % 2 == 0).all()
+
+
 @pytest.mark.parametrize("turned", [False, True])
 def test_hong2018_drops_faces_whose_back_is_to_the_light(turned):
     plate = np.array([[-1.0, 0, 1], [1, 0, 1], [1.1, 0, -1], [-1, 0, -1.2]])
@@ -274,3 +314,21 @@ def test_what_the_methods_cannot_do_is_refused():
         render_tsm(scene, n_layers=2, **(options | {"size_px": 0}))
     with pytest.raises(ValueError, match="bias: expected"):
         render_tsm(scene, n_layers=2, **(options | {"bias": -1.0}))
+
+
+def test_the_comparison_finds_the_exact_shadows_closest(tmp_path, monkeypatch, capsys):
+    path = Path(__file__).resolve().parent.parent / "scripts" / "shadow_comparison.py"
+    spec = importlib.util.spec_from_file_location("shadow_comparison", path)
+    script = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(script)
+    for name, value in (("MAP_SIZE_PX", 128), ("COUNTS", (4,))):
+        monkeypatch.setattr(script, name, value)
+    monkeypatch.setattr(script.torch, "set_num_threads", lambda n: None)
+    monkeypatch.setattr(sys, "argv", ["shadow_comparison.py", "--quick", "--size", "20", "--out", str(tmp_path)])
+    script.main()
+    found = json.loads((tmp_path / "shadow_comparison.json").read_text(encoding="utf-8"))["methods"]
+    off = {name: numbers["visibility_rmse"] for name, numbers in found.items()}
+    assert min(off, key=off.get) == "torchblur"
+    assert off["torchblur"] < 0.005 < 0.02 < off["hong2018, 4 samples"] < off["tsm, 4 layers"]
+    assert capsys.readouterr().out.count("\n| ") == len(found) + 1
+    assert (tmp_path / "shadow_comparison.png").stat().st_size > 2_000

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 import torchblur as tb
-from datagen.baselines.shadow_samples import MovingFaces, boxes_px, centres_ndc, pixels_in
-from torchblur import check
+from datagen.baselines.shadow_samples import MovingFaces, boxes_px
+from torchblur import check, packed
 from torchblur.lights import unit
 
 MAX_SPOT_DEG = 80.0  # a wider cone does not fit one view
@@ -116,22 +116,34 @@ def rasterise(views: LightViews, corners: Tensor, view: Tensor) -> Texels:
 
     Source: Olano & Greer 1997 (homogeneous rasterisation); depth is linear in space, so perspective is right.
     """
-    n = views.size_px
-    xyw = corners[..., :3]
-    pixel, triangle = pixels_in(boxes_px(xyw, n, n), n)
-    x0, y0 = centres_ndc(pixel, n, n)
-    side = torch.linalg.cross(xyw[:, [1, 2, 0]], xyw[:, [2, 0, 1]])[triangle]  # (pairs, 3, 3): linear in the ray
-    e = side[..., 0] * x0.unsqueeze(1) + side[..., 1] * y0.unsqueeze(1) + side[..., 2]
-    along = torch.where(side[..., 0] != 0, side[..., 0], side[..., 1])
-    sign = torch.where(e != 0, e, along)
-    kept = ((sign > 0).all(1) | (sign < 0).all(1)).nonzero().flatten()
-    pixel, triangle, e = pixel[kept], triangle[kept], e[kept]
-    total = e.sum(1)
-    bary = e / torch.where(total != 0, total, 1.0).unsqueeze(1)
-    w, depth = ((bary * corners[..., k][triangle]).sum(1) for k in (2, 3))
-    kept = ((total != 0) & (w > 0)).nonzero().flatten()
-    texel = view[triangle] * n * n + pixel
-    return Texels(texel[kept], triangle[kept], bary[kept], depth[kept])
+    n, xyw = views.size_px, corners[..., :3]
+    box = boxes_px(xyw, n, n)
+    side = torch.linalg.cross(xyw[:, [1, 2, 0]], xyw[:, [2, 0, 1]])  # edge functions, linear in the ray (x, y, 1)
+    n_rows = torch.where(box[2] >= box[0], box[3] - box[1] + 1, 0).clamp(min=0)
+    row, row_of = packed.expand(box[1], n_rows)
+    y = 1 - 2 * (row.to(torch.float64) + 0.5) / n
+    slope, level = side[row_of, :, 0], side[row_of, :, 1] * y.unsqueeze(1) + side[row_of, :, 2]
+    parts = []
+    for turn in (1, -1):
+        zero = -level / slope
+        low = torch.where(turn * slope > 0, zero, -torch.inf).amax(1)
+        high = torch.where(turn * slope < 0, zero, torch.inf).amin(1)
+        first = ((low + 1) * (n / 2) - 0.5 - 1e-6).ceil().clamp(-1, n).long().maximum(box[0, row_of])
+        last = ((high + 1) * (n / 2) - 0.5 + 1e-6).floor().clamp(-1, n).long().minimum(box[2, row_of])
+        column, own = packed.expand(first, (last - first + 1).clamp(min=0))
+        triangle = row_of[own]
+        x = 2 * (column.to(torch.float64) + 0.5) / n - 1
+        e = slope[own] * x.unsqueeze(1) + level[own]
+        along = torch.where(slope != 0, slope, side[row_of, :, 1])[own]
+        sign = torch.where(e != 0, e, along)  # a centre on an edge belongs to the face on one side of it
+        total = e.sum(1)
+        kept = ((turn * sign > 0).all(1) & (total != 0)).nonzero().flatten()
+        triangle, bary = triangle[kept], e[kept] / total[kept].unsqueeze(1)
+        w, depth = ((bary * corners[..., k][triangle]).sum(1) for k in (2, 3))
+        texel = view[triangle] * n * n + row[own[kept]] * n + column[kept]
+        ahead = (w > 0).nonzero().flatten()
+        parts.append((texel[ahead], triangle[ahead], bary[ahead], depth[ahead]))
+    return Texels(*(torch.cat(p) for p in zip(*parts, strict=True)))
 
 
 def _frame(axis: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from torch import Tensor
 import torchblur as tb
 from datagen.baselines.shadow_samples import Hits, MovingFaces, ShadowedImage, average_samples, gather_faces
 from torchblur import check
-from torchblur.lights import unit
+from torchblur.lights import Light, unit
 
 MAX_TESTS = 2_000_000  # rays and faces looked at together
 SKIPPED = 1e-9  # share of the way to the light that rays skip
@@ -37,17 +37,16 @@ def trace_shadows(scene: tb.Scene, *, n_subframes: int) -> ShadowedImage:
         share = torch.ones_like(hits.t)
         for k in torch.unique(hits.sample).tolist():
             own = (hits.sample == k).nonzero().flatten()
-            share[own] = _visible_at(scene.lights[0], faces, float(instants[k]), (hits.world[own], hits.face[own]))
+            share[own] = _visible_at(scene.lights[0], faces, float(instants[k]), hits.world[own])
         return share
 
     image, visibility = average_samples(scene, faces, times, visible)
     return ShadowedImage(image, visibility, 0, {"subframes": n_subframes})
 
 
-def _visible_at(light: object, faces: MovingFaces, t: float, hits: tuple[Tensor, Tensor]) -> Tensor:
-    """Return (J,) 0 or 1 whether the light is seen from points (J, 3) on faces (J,)."""
-    point, own = hits
-    corner, face = faces.world_at(t)
+def _visible_at(light: Light, faces: MovingFaces, t: float, point: Tensor) -> Tensor:
+    """Return (J,) 0 or 1 whether the light is seen from points (J, 3) on surfaces."""
+    corner = faces.world_at(t)
     if isinstance(light, tb.DirectionalLight):
         origin = corner.new_zeros(3)
         way = -unit(light.direction.to(corner).reshape(-1, 3)[0])
@@ -56,7 +55,7 @@ def _visible_at(light: object, faces: MovingFaces, t: float, hits: tuple[Tensor,
     corner = corner - origin
     following, last = corner[:, [1, 2, 0]], corner[:, [2, 0, 1]]
     if way is None:
-        side, constant = torch.linalg.cross(following, last), corner.new_zeros(len(face), 3)
+        side, constant = torch.linalg.cross(following, last), corner.new_zeros(len(corner), 3)
     else:
         side = torch.linalg.cross(way.expand_as(corner), following - last)
         constant = (side * (following + last)).sum(-1) / 2
@@ -64,10 +63,10 @@ def _visible_at(light: object, faces: MovingFaces, t: float, hits: tuple[Tensor,
     height = (normal * corner[:, 0]).sum(1)  # of the face's plane over the origin
     is_seen = torch.ones(len(point), dtype=torch.float64, device=point.device)
     size = (corner.amax((0, 1)) - corner.amin((0, 1))).max()
-    for rays in torch.arange(len(point), device=point.device).split(max(1, MAX_TESTS // max(1, len(face)))):
+    for rays in torch.arange(len(point), device=point.device).split(max(1, MAX_TESTS // max(1, len(corner)))):
         x = point[rays] - origin
         e = (x @ side.reshape(-1, 3).T - constant.reshape(-1)).reshape(len(rays), -1, 3)
-        crosses = ((e >= 0).all(2) | (e <= 0).all(2)) & (face != own[rays].unsqueeze(1))
+        crosses = (e >= 0).all(2) | (e <= 0).all(2)
         ray, which = crosses.nonzero(as_tuple=True)
         above = height[which] - (normal[which] * x[ray]).sum(1)  # of the plane over the point
         if way is None:

@@ -39,11 +39,20 @@ class MovingFaces:
     is_lit: Tensor  # (S,) bool
     is_one_sided: Tensor  # (S,) bool
 
-    def world_at(self, t: float) -> tuple[Tensor, Tensor]:
-        """Return the corners (F, 3, 3) of the faces at a shutter time, and which faces (F,) these are."""
+    def world_at(self, t: float) -> Tensor:
+        """Return the corners (F, 3, 3) of the faces at a shutter time."""
         now = ((self.t_open <= t) & (t < self.t_close) | (self.t_close == t) & (t == 1)).nonzero().flatten()
         u = ((t - self.t_open) / (self.t_close - self.t_open))[now].reshape(-1, 1, 1)
-        return (1 - u) * self.world[0, now] + u * self.world[1, now], self.face[now]
+        return (1 - u) * self.world[0, now] + u * self.world[1, now]
+
+
+@dataclass(frozen=True, eq=False)
+class SweptPairs:
+    """Pixels, and moving faces that may cross their centres."""
+
+    pixel: Tensor  # (pairs,) int64
+    moving: Tensor  # (pairs,) int64 of S
+    edge: Tensor  # (3 coefficients, 3 edges, pairs) Bernstein form of the edge functions over the slice
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +143,7 @@ def average_samples(
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=scene.device)
     due, arriving = (torch.zeros(n_pixels, dtype=torch.float64, device=scene.device) for _ in range(2))
     pairs = _swept_pairs(scene, faces)
-    step = max(1, MAX_TESTS // max(1, len(pairs[0])))
+    step = max(1, MAX_TESTS // max(1, len(pairs.pixel)))
     for first in range(0, n, step):
         hits = _find_hits(scene, faces, pairs, (times[first : first + step], first))
         to_light, irradiance = scene.lights[0].arriving(hits.world.T, hits.t)
@@ -187,35 +196,37 @@ def centres_ndc(pixel: Tensor, width: int, height: int) -> tuple[Tensor, Tensor]
     return 2 * (column + 0.5) / width - 1, 1 - 2 * (row + 0.5) / height
 
 
-def _swept_pairs(scene: tb.Scene, faces: MovingFaces) -> tuple[Tensor, Tensor]:
-    """Return pixels and the moving faces (of S) that may cross them."""
+def _swept_pairs(scene: tb.Scene, faces: MovingFaces) -> SweptPairs:
+    """Return pixels and the moving faces that may cross them. Source: Laine & Karras 2011 (tests against bounds)."""
     width, height = scene.camera.width, scene.camera.height
-    corners = faces.clip[..., [0, 1, 3]].permute(1, 0, 2, 3).flatten(1, 2)
-    return pixels_in(boxes_px(corners, width, height), width)
+    xyw = faces.clip[..., [0, 1, 3]]
+    pixel, moving = pixels_in(boxes_px(xyw.transpose(0, 1).flatten(1, 2), width, height), width)
+    following, last = xyw[:, :, [1, 2, 0]], xyw[:, :, [2, 0, 1]]
+    cross = torch.linalg.cross
+    middle = (cross(following[0], last[1]) + cross(following[1], last[0])) / 2
+    side = torch.stack([cross(following[0], last[0]), middle, cross(following[1], last[1])])  # (3, S, 3, 3)
+    x0, y0 = centres_ndc(pixel, width, height)
+    edge = torch.stack([side[..., 0], side[..., 1], side[..., 2]])[..., moving, :]
+    edge = edge[0] * x0.unsqueeze(1) + edge[1] * y0.unsqueeze(1) + edge[2]  # (3, pairs, 3)
+    front, back = ((turn * edge >= 0).any(0).all(1) for turn in (1, -1))
+    kept = (front | (back & ~faces.is_one_sided[moving])).nonzero().flatten()
+    return SweptPairs(pixel[kept], moving[kept], edge.permute(0, 2, 1)[..., kept].contiguous())
 
 
-def _find_hits(scene: tb.Scene, faces: MovingFaces, pairs: tuple, samples: tuple[Tensor, int]) -> Hits:
+def _find_hits(scene: tb.Scene, faces: MovingFaces, pairs: SweptPairs, samples: tuple[Tensor, int]) -> Hits:
     """Return what the samples `samples[0]` (N, P) see, the first of them being number `samples[1]`."""
     times, first = samples
-    pixel, moving = pairs
-    t = times[:, pixel]
-    sample, pair = ((t >= faces.t_open[moving]) & (t <= faces.t_close[moving])).nonzero(as_tuple=True)
-    pixel, moving, t = pixel[pair], moving[pair], t[sample, pair]
+    t = times[:, pairs.pixel]
+    sample, pair = ((t >= faces.t_open[pairs.moving]) & (t <= faces.t_close[pairs.moving])).nonzero(as_tuple=True)
+    pixel, moving, t = pairs.pixel[pair], pairs.moving[pair], t[sample, pair]
     u = (t - faces.t_open[moving]) / (faces.t_close - faces.t_open)[moving]
-    x0, y0 = centres_ndc(pixel, scene.camera.width, scene.camera.height)
-    part = [
-        (1 - u) * faces.clip[0, :, c, k][moving] + u * faces.clip[1, :, c, k][moving]
-        for c in range(3)
-        for k in (0, 1, 3)
-    ]
-    x = [part[3 * c] - x0 * part[3 * c + 2] for c in range(3)]
-    y = [part[3 * c + 1] - y0 * part[3 * c + 2] for c in range(3)]
-    e = torch.stack([x[(c + 1) % 3] * y[(c + 2) % 3] - y[(c + 1) % 3] * x[(c + 2) % 3] for c in range(3)], dim=1)
-    total = e.sum(1)
-    inside = ((e >= 0).all(1) | ((e <= 0).all(1) & ~faces.is_one_sided[moving])) & (total != 0)
+    weights = (1 - u).square(), 2 * u * (1 - u), u.square()
+    e = torch.stack([sum(w * c[pair] for w, c in zip(weights, edge, strict=True)) for edge in pairs.edge.unbind(1)])
+    total = e.sum(0)
+    inside = ((e >= 0).all(0) | ((e <= 0).all(0) & ~faces.is_one_sided[moving])) & (total != 0)
     kept = inside.nonzero().flatten()
-    sample, pixel, moving, t, u, e, total = (v[kept] for v in (sample, pixel, moving, t, u, e, total))
-    weight = e / total.unsqueeze(1)
+    sample, pixel, moving, t, u, total = (v[kept] for v in (sample, pixel, moving, t, u, total))
+    weight = e[:, kept].T / total.unsqueeze(1)
     z, w = (_blend(faces.clip[..., k], moving, u, weight) for k in (2, 3))
     kept = ((w + z >= 0) & (w - z >= 0)).nonzero().flatten()
     owner = (sample * times.shape[1] + pixel)[kept]

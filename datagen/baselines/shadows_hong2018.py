@@ -88,7 +88,7 @@ def render_hong2018(
         n_samples: of a pixel.
         size_px: texels along each side of the map (of each of the six of a point light).
         bias: by how much a range must be nearer to the light than a point to shade it [scene units].
-        generator: gives the times.
+        generator: on the CPU, gives the times.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -210,8 +210,11 @@ def _find_crossing(p: Tensor, q: Tensor, p_end: Tensor, q_end: Tensor) -> tuple[
         (1 - k) * one + k * two
         for k, one, two in zip(ways, (screen[0], screen[2]), (screen[1], screen[3]), strict=True)
     )
-    before, after = before / before[:, 2:3], after / after[:, 2:3]
-    return (before + after) / 2, does_cross
+    both = []
+    for k in (before, after):
+        x_y, inverse, depth = k.split((2, 1, 1), dim=1)
+        both.append(torch.cat([x_y, torch.ones_like(inverse), depth], dim=1) / inverse)
+    return sum(both) / 2, does_cross
 
 
 def _is_dropped(prisms: Tensor, sees_all: bool) -> Tensor:

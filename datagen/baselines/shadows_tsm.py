@@ -38,7 +38,7 @@ def render_tsm(
         n_layers: strata of the exposure.
         size_px: texels along each side of a map (of each of the six of a point light).
         bias: by how much a texel must be nearer to the light than a point to shade it [scene units].
-        generator: gives the times.
+        generator: on the CPU, gives the times.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -64,7 +64,7 @@ def render_tsm(
 
 def _depth_map(views: LightViews, faces: MovingFaces, t: float) -> Tensor:
     """Return (texels,) the depth of what the light sees nearest at a time, inf where nothing."""
-    corners = views.project(faces.world_at(t)[0])  # (V, F, 3, 4)
+    corners = views.project(faces.world_at(t))  # (V, F, 3, 4)
     view = torch.arange(len(corners), device=corners.device).repeat_interleave(corners.shape[1])
     found = rasterise(views, corners.flatten(0, 1), view)
     nearest = torch.full((views.n_texels,), torch.inf, dtype=torch.float64, device=corners.device)

@@ -137,6 +137,16 @@ TRUTH = {
     "lit at rest": ([sheet(shading="lambert")], "lighting", [STILL_LAMP]),
     "lit by a light that moves": ([sheet(shading="lambert")], "lighting curvature", [MOVING_LAMP]),
     "lit in motion": ([sheet(shading="lambert", shift=[0.1, 0, 0])], "lighting motion curvature", [STILL_LAMP]),
+    "lit sheets in the light of each other": (
+        [sheet(shading="lambert"), sheet(-0.5, shading="lambert")],
+        "lighting shadows",
+        [STILL_LAMP],
+    ),
+    "lit before a sheet that moves and casts": (
+        [sheet(-0.5, [0.4, 0, 0], (-0.9, -0.4)), sheet(shading="lambert")],
+        "lighting motion curvature shadows",
+        [STILL_LAMP],
+    ),
     "lit in motion from everywhere alike": ([sheet(shading="lambert", shift=[0.1, 0, 0])], "lighting motion"),
     "a light on nothing that is lit": ([sheet()], "", [MOVING_LAMP]),
     "through the near plane": ([approaching(-0.5, -1.5)], "motion clipping"),

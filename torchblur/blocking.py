@@ -22,12 +22,11 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein
-from torchblur.casters import Casters
+from torchblur.casters import BIAS, Casters
 from torchblur.lights import DirectionalLight, Light, along
 from torchblur.sort import between
 
 EDGES = ((0, 1), (1, 2), (2, 0))
-BIAS = 1e-6  # of the casters' extent: a caster nearer than this to a point does not block it; float32 is that coarse
 NOISE = 1e-14  # of the product of the factors' sizes
 HALVINGS = 4  # of the shared time, before roots are sought: cheaper, as most pairs prove not to block
 

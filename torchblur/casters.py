@@ -16,6 +16,8 @@ from torch import Tensor
 
 from torchblur.scene import Scene
 
+BIAS = 1e-6  # of the casters' extent: a caster nearer than this to a point does not block it; float32 is that coarse
+
 
 @dataclass(frozen=True, eq=False)
 class Casters:
@@ -38,7 +40,8 @@ class Casters:
 @torch.no_grad()
 def find_casters(scene: Scene) -> Casters | None:
     """Return what casts shadows in a scene: every face, lit or not, from both sides, whose opacity is not 0 (or asks
-    for a gradient). None where no light casts shadows, nothing is lit or there are no such faces. Source: ours.
+    for a gradient). None where no light casts shadows, nothing is lit, there are no such faces, or all of
+    them lie in one plane that does not turn, so that none can come before another. Source: ours.
     """
     lights = [light for light in scene.lights if light.casts_shadows]
     if not lights or all(mesh.material.shading != "lambert" or mesh.n_faces == 0 for mesh in scene.meshes):
@@ -65,4 +68,20 @@ def find_casters(scene: Scene) -> Casters | None:
         return None
     low, high = (find(world.movedim(2, 0).flatten(1), dim=1) for find in (torch.amin, torch.amax))
     extent = float(torch.cat([high - low, low.abs(), high.abs()]).max())
+    if all(_is_flat(world[..., t_open == t], BIAS * extent) for t in torch.unique(t_open)):
+        return None
     return Casters(world, t_open, t_close, face, 0.5 * (low + high), extent, moves)
+
+
+def _is_flat(world: Tensor, slack: float) -> bool:
+    """Return whether corners (2, 3, 3, C) lie in one plane, to `slack`, and all move alike."""
+    shift = world[1] - world[0]
+    if float((shift.amax((0, 2)) - shift.amin((0, 2))).max()) > slack:
+        return False
+    first = world[0, 0]
+    normal = torch.linalg.cross(world[0, 1] - first, world[0, 2] - first, dim=0)
+    area = normal.square().sum(0)
+    largest = int(area.argmax())
+    across = normal[:, largest] / area[largest].sqrt().clamp(min=torch.finfo(area.dtype).tiny)
+    away = torch.einsum("d,kdn->kn", across, world[0] - first[:, largest].unsqueeze(1))
+    return float(away.abs().max()) <= slack

@@ -30,10 +30,12 @@ from torch import Tensor
 
 from torchblur import bernstein, packed
 
-TOLERANCE = 1e-6  # of what is looked at: the contrast of a texture between neighbours, the light on a facing surface
+TOLERANCE = (
+    4e-7  # of a texture's contrast, of light on a facing surface; cut in two ways, they differ by less than 1e-6
+)
 RHO = (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 25.0, 50.0, 100.0, 300.0, 1e3, 1e4, 1e6, 1e8)
-GROWTH = 60.0  # 20 for S^2 (N V) / (|N| |V|^3), with N and V within a quarter of their middles and S within a half;
-# 3 for the share of a mip level
+LEVELS = 3.0  # what the share of a mip level grows by
+GROWTH = 20.0 * LEVELS  # S^2 (N V) / (|N| |V|^3), with N and V within a quarter of their middles and S within a half
 SCALE_LIMIT = 0.5  # share of |c_0| by which S may vary
 VECTOR_LIMIT = 0.25  # and by which other q may
 ROUNDING = 1e-13  # of c_0: smaller coefficients are rounding
@@ -98,8 +100,8 @@ def nodes_needed(
         for owner, sizes, limit in sized:
             fits[owner[_tail(sizes, rho) > limit * sizes[0]]] = False
         grown = torch.log1p(2 * _tail(away, rho) / middle.abs()).sum(0)
-        growth = torch.zeros_like(start).scatter_reduce(0, of[~multiplies], grown[~multiplies], "amax")
-        growth = growth.index_add(0, of[multiplies], grown[multiplies]) + math.log1p(rho / 2)
+        growth = torch.zeros_like(start).scatter_reduce(0, of, grown, "amax")  # colour, one at a time, times opacities
+        growth = growth.index_add(0, of[multiplies], grown[multiplies] + math.log(LEVELS)) + math.log1p(rho / 2)
         growth = growth + degree * math.log(rho) if slopes else growth
         bound = growth + math.log(64 / 15 / 2 * GROWTH / (1 - rho**-2) / TOLERANCE)
         needed = torch.where(fits, torch.minimum(needed, bound / (2 * math.log(rho))), needed)

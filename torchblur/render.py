@@ -45,7 +45,7 @@ class Frame:
     shadow: (
         Tensor | None
     )  # (H, W) share of the direct light due to what the pixel sees that no shadow takes away; 1 where
-    # none is due; None where no light of the scene casts shadows on anything
+    # none is due; None where no light of the scene casts shadows
     counts: dict[str, int]  # how many of ledger.COUNTS
     timings: dict[str, float]  # seconds in each of ledger.STAGES
     plan: EffectPlan  # which effects were simulated, and why
@@ -202,7 +202,8 @@ class _Job:
                 prisms, survey, chosen = follow_plan(plan, prisms, survey, self.accuracy)
             work = _Work(plan, prisms, survey, chosen)
             total = sum(self._image(work, ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
-            return [self._frame(image, plan, surfaces.casters is not None) for image in total]
+            casts = any(light.casts_shadows for light in scene.lights)
+            return [self._frame(image, plan, casts) for image in total]
 
     def _frame(self, image: Tensor, plan: EffectPlan, has_shadows: bool) -> Frame:
         """Return the frame of (H, W, N_LOOKS + M) looks and coverage."""

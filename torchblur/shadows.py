@@ -120,7 +120,7 @@ def find_shadows(surfaces: Surfaces, receivers: Receivers, is_due: tuple[Tensor,
         receivers: K points over slices of time, in which no light has a knot.
         is_due: light by light (K,) bool, whether the light is due at all: not where the surface faces away throughout.
 
-    Accuracy: exact; a caster nearer to a point than blocking.BIAS of the casters' extent does not block it.
+    Accuracy: exact; a caster nearer to a point than casters.BIAS of the casters' extent does not block it.
     Source: ours.
     """
     found, n_pairs = [], 0

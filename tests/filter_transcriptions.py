@@ -234,3 +234,109 @@ def directional_image(color, motion):
                     total = [s + kernel[v][u] * c for s, c in zip(total, color[py][px], strict=True)]
             result[y].append(total)
     return result
+
+
+def through(points, times, s):
+    """The polynomial through the points at the times, by Lagrange's formula, at s."""
+    result = [0.0] * len(points[0])
+    for k, t in enumerate(times):
+        weight = 1.0
+        for j, u in enumerate(times):
+            if j != k:
+                weight *= (s - u) / (t - u)
+        result = [r + weight * p for r, p in zip(result, points[k], strict=True)]
+    return result
+
+
+def on_arc(points, times, s):
+    """The point of the circle through three points at s; depth by the polynomial. None where they lie on a line."""
+    (ax, ay, _), (bx, by, _), (cx, cy, _) = points
+    bend = (bx - ax) * (cy - by) - (by - ay) * (cx - bx)
+    if abs(bend) <= 1e-3 * math.hypot(bx - ax, by - ay) * math.hypot(cx - bx, cy - by):
+        return None
+    d = 2 * (ax * (by - cy) + bx * (cy - ay) + cx * (ay - by))
+    ox = ((ax**2 + ay**2) * (by - cy) + (bx**2 + by**2) * (cy - ay) + (cx**2 + cy**2) * (ay - by)) / d
+    oy = ((ax**2 + ay**2) * (cx - bx) + (bx**2 + by**2) * (ax - cx) + (cx**2 + cy**2) * (bx - ax)) / d
+    angles = [math.atan2(y - oy, x - ox) for x, y, _ in points]
+    for k in (1, 2):
+        while (angles[k] - angles[k - 1]) * (1 if bend > 0 else -1) < 0:
+            angles[k] += 2 * math.pi if bend > 0 else -2 * math.pi
+    angle = through([[a] for a in angles], times, s)[0]
+    radius = math.hypot(ax - ox, ay - oy)
+    return [ox + radius * math.cos(angle), oy + radius * math.sin(angle), through(points, times, s)[2]]
+
+
+def line_pixels(a, b):
+    """Pixels of a segment, one at each pixel centre along its longer axis, start included, end not: (share, x, y)."""
+    steep = abs(b[1] - a[1]) > abs(b[0] - a[0])
+    p, q = (a[1], b[1]) if steep else (a[0], b[0])
+    found = []
+    for k in range(math.floor(min(p, q)) - 2, math.ceil(max(p, q)) + 3):
+        centre = k + 0.5
+        if p <= centre < q or q < centre <= p:
+            share = (centre - p) / (q - p)
+            other = (a[0] + share * (b[0] - a[0])) if steep else (a[1] + share * (b[1] - a[1]))
+            found.append((share, math.floor(other), k) if steep else (share, k, math.floor(other)))
+    return found
+
+
+def guertin2015(color, offset, depth, times, options):
+    """The scatter filter. offset [k][y][x] = (x, y), depth [k][y][x]; options: static (colour, depth) or None, arc,
+    by_time, points, background_weight, sigma, counts [y][x] samples of a curve when by time.
+    """
+    height, width, now = len(color), len(color[0]), times.index(0.5)
+    below = [[list(c) for c in row] for row in color]
+    below_depth = [list(row) for row in depth[now]]
+    moves = [[False] * width for _ in range(height)]
+    for y in range(height):
+        for x in range(width):
+            far = max(math.hypot(*offset[k][y][x]) for k in range(len(times)))
+            moves[y][x] = far > 0.5 and all(math.isfinite(depth[k][y][x]) for k in range(len(times)))
+            if options["static"] is not None:
+                z = depth[now][y][x]
+                back, back_depth = options["static"][0][y][x], options["static"][1][y][x]
+                stays = math.isfinite(z) and not moves[y][x] and z <= 1.01 * back_depth
+                below[y][x], below_depth[y][x] = (list(color[y][x]), z) if stays else (list(back), back_depth)
+    total = [[[0.0] * (len(color[0][0]) + 1) for _ in range(width)] for _ in range(height)]
+
+    def add(source, target, z, weight):
+        (x, y), (px, py) = source, target
+        if 0 <= px < width and 0 <= py < height and z <= 1.01 * below_depth[py][px]:
+            for c, value in enumerate([*color[y][x], 1.0]):
+                total[py][px][c] += weight * value
+
+    for y in range(height):
+        for x in range(width):
+            if not moves[y][x]:
+                continue
+            points = [
+                [x + 0.5 + offset[k][y][x][0], y + 0.5 + offset[k][y][x][1], depth[k][y][x]] for k in range(len(times))
+            ]
+
+            def place(s, points=points):
+                arc = on_arc(points, times, s) if options["arc"] else None
+                return through(points, times, s) if arc is None else arc
+
+            if options["by_time"]:
+                m = options["counts"][y][x]
+                for k in range(m):
+                    px, py, z = place((k + 0.5) / m)
+                    add((x, y), (math.floor(px), math.floor(py)), z, 1 / m)
+                continue
+            n = options["points"] - 1
+            for k in range(n):
+                a, b = (
+                    [round(256 * p[0]) / 256, round(256 * p[1]) / 256, p[2]] for p in (place(k / n), place((k + 1) / n))
+                )
+                for share, px, py in line_pixels(a, b):
+                    weight = math.exp(-0.5 * (((k + share) / n - 0.5) / options["sigma"]) ** 2)
+                    add((x, y), (px, py), a[2] + share * (b[2] - a[2]), weight)
+    result = []
+    for y in range(height):
+        result.append([])
+        for x in range(width):
+            *light, alpha = total[y][x]
+            rest = max(0.0, 1 - alpha) if options["by_time"] else options["background_weight"]
+            over = max(1.0, alpha) if options["by_time"] else alpha + options["background_weight"]
+            result[y].append([(a + rest * c) / over for a, c in zip(light, below[y][x], strict=True)])
+    return result

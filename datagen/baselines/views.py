@@ -90,12 +90,34 @@ class Paths:
         return (far > STILL_PX) & torch.isfinite(self.depth_view).all(1)
 
 
-def same_image(name: str, value: Any, color: Tensor) -> Tensor:
-    """Return `value` as a float tensor of the shape (channels free), type and device of `color` (B, C, H, W)."""
-    b, _, h, w = color.shape
-    tensor = check.floats(name, value, (b, "C", h, w))
-    _same_kind(color=color, **{name: tensor})
-    return tensor
+@dataclass(frozen=True, eq=False)
+class Layer:
+    """A batch of images with their depth.
+
+    Args:
+        color: (B, C, H, W) float32 or float64, linear.
+        depth_view: (B, 1, H, W) view depth [scene units] above 0; inf where nothing is.
+
+    Raises:
+        TypeError, ValueError: wrong shape, type or device, NaN, or sizes that differ; the argument is named.
+    """
+
+    color: Tensor
+    depth_view: Tensor
+
+    def __post_init__(self) -> None:
+        color = check.floats("color", self.color, ("B", "C", "H", "W"))
+        b, _, h, w = color.shape
+        depth = _depth("depth_view", self.depth_view, (b, 1, h, w))
+        _same_kind(color=color, depth_view=depth)
+        object.__setattr__(self, "color", color)
+        object.__setattr__(self, "depth_view", depth)
+
+    def check_fits(self, name: str, color: Tensor) -> None:
+        """Raise unless the layer has the shape, type and device of `color`."""
+        if self.color.shape != color.shape:
+            raise check.fail(name, f"images of {tuple(color.shape)}", self.color)
+        _same_kind(color=color, **{name: self.color})
 
 
 def find_view(scene: tb.Scene, now: tb.Instant) -> tuple[View, int]:

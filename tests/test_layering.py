@@ -52,6 +52,7 @@ TORCHBLUR = [
     "resolve",
     "fragments",
     "instant",
+    "time_samples",
     "sampling",
     "metrics",
     "render",
@@ -243,7 +244,7 @@ def test_no_assert_guards_user_input():
 
 def test_public_names_exist_and_are_documented():
     constructors = {"Accuracy", "Camera", "Material", "Mesh", "Scene", "Shutter"}
-    functions = {"accumulate", "motion_to", "render", "render_instant"}
+    functions = {"accumulate", "motion_to", "render", "render_instant", "stochastic"}
     assert constructors | functions <= set(torchblur.__all__)
     for name in torchblur.__all__:
         assert getattr(torchblur, name).__doc__, name

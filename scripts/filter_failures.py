@@ -149,7 +149,7 @@ def main() -> None:
     print(f"| {arguments.size} px | " + " | ".join(methods) + " |")
     print("|---|" + "--:|" * len(methods))
     for column, values in columns.items():
-        print(f"| {column} | " + " | ".join(f"{values[m]:.3f}" for m in methods) + " |")
+        print(f"| {column} | " + " | ".join(f"{round(values[m], 3) + 0.0:.3f}" for m in methods) + " |")
     if arguments.pictures:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
         for name, of_scene in found.items():

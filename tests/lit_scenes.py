@@ -16,7 +16,7 @@ MIRRORED = np.eye(4)  # the same x and y seen from z = -1, so left and right are
 BACKGROUND = (0.2, 0.3, 0.4)
 
 
-def to_torch(plain: LookScene, dtype=torch.float64) -> tb.Scene:
+def to_torch(plain: LookScene, dtype=torch.float64, casts_shadows: bool = False) -> tb.Scene:
     """Return the torchblur scene of a plain one."""
 
     def tensor(array):
@@ -36,18 +36,18 @@ def to_torch(plain: LookScene, dtype=torch.float64) -> tb.Scene:
         faces = torch.tensor(m.faces.copy())
         meshes.append(tb.Mesh(tensor(m.vertices), faces, material, uv=tensor(m.uv), normals=tensor(m.normals)))
     camera = tb.Camera(torch.tensor(plain.world_to_clip.copy()), plain.width, plain.height)
-    lights = [to_light(light, tensor) for light in plain.lights]
+    lights = [to_light(light, tensor, casts_shadows) for light in plain.lights]
     return tb.Scene(meshes, camera, tensor(plain.background), lights=lights, ambient=tensor(plain.ambient))
 
 
-def to_light(light: PlainLight, tensor) -> tb.PointLight | tb.SpotLight | tb.DirectionalLight:
+def to_light(light: PlainLight, tensor, casts_shadows: bool) -> tb.PointLight | tb.SpotLight | tb.DirectionalLight:
     """Return the torchblur light of a plain one."""
     if light.kind == "directional":
-        return tb.DirectionalLight(tensor(light.direction), tensor(light.power))
+        return tb.DirectionalLight(tensor(light.direction), tensor(light.power), casts_shadows=casts_shadows)
     if light.kind == "point":
-        return tb.PointLight(tensor(light.position), tensor(light.power))
-    angles = {"inner_angle_deg": light.inner_deg, "outer_angle_deg": light.outer_deg}
-    return tb.SpotLight(tensor(light.position), tensor(light.target), tensor(light.power), **angles)
+        return tb.PointLight(tensor(light.position), tensor(light.power), casts_shadows=casts_shadows)
+    rest = {"inner_angle_deg": light.inner_deg, "outer_angle_deg": light.outer_deg, "casts_shadows": casts_shadows}
+    return tb.SpotLight(tensor(light.position), tensor(light.target), tensor(light.power), **rest)
 
 
 def point(position, power=1.0) -> PlainLight:

@@ -16,11 +16,10 @@ import torch
 import torchblur as tb
 
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "references"
-NEEDS = {"shadow_floor": "lights and shadows"}
 
 
 def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
-    """Return the scene of a folder, one mesh, and the reference image (H, W, 3)."""
+    """Return the scene of a folder, a mesh for unlit and one for lit faces, and the reference image (H, W, 3)."""
     exr = pytest.importorskip("OpenEXR")
     with np.load(folder / "scene.npz", allow_pickle=False) as z:
         s = {k: z[k] for k in z.files}
@@ -31,10 +30,17 @@ def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
         texture = np.load(folder / "texture.npy", allow_pickle=False)[::-1]  # stored with row 0 at v = 0
         uv = torch.as_tensor(s["uv"])
     color, opacity = torch.as_tensor(s["face_color"]), torch.as_tensor(s["face_opacity"])
-    material = tb.Material(color, opacity, texture=texture, wrap="clamp", mipmap=False)
-    mesh = tb.Mesh(vertices, torch.as_tensor(s["faces"]), material, uv=uv)
+    is_lit = s.get("face_lambert", np.zeros(len(s["faces"]), np.uint8)) > 0
+    meshes = []
+    for shading, chosen in (("unlit", ~is_lit), ("lambert", is_lit)):
+        if chosen.any():
+            look = {"texture": texture, "wrap": "clamp", "mipmap": False, "shading": shading}
+            material = tb.Material(color[chosen], opacity[chosen], **look)
+            own_uv = None if uv is None else uv[chosen]
+            meshes.append(tb.Mesh(vertices, torch.as_tensor(s["faces"][chosen]), material, uv=own_uv))
+    lights = [tb.PointLight(s["light_position"], float(s["light_intensity"]))] if is_lit.any() else []
     camera = tb.Camera(torch.as_tensor(s["world_to_clip"]), int(s["width"]), int(s["height"]))
-    scene = tb.Scene([mesh], camera, torch.as_tensor(s["background"]))
+    scene = tb.Scene(meshes, camera, torch.as_tensor(s["background"]), lights=lights)
     with exr.File(str(folder / "ref.exr")) as file:
         channels = file.parts[0].channels
         if "RGB" in channels:
@@ -47,8 +53,6 @@ def read_scene(folder: Path, dtype: torch.dtype) -> tuple[tb.Scene, np.ndarray]:
 
 @pytest.mark.parametrize("name", ["quad", "tris200", "plank", "shadow_floor"])
 def test_matches_the_path_tracer_within_its_noise(name, dtype):
-    if name in NEEDS:
-        pytest.skip(f"{name}: this scene needs {NEEDS[name]}, which torchblur does not have yet")
     if not (FOLDER / name).is_dir():
         pytest.skip(f"NOT TESTED: reference images are not at {FOLDER}")
     if name == "tris200" and dtype == torch.float64:

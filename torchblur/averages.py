@@ -1,7 +1,7 @@
 """The mean look of a layer over a cell, as the papers approximate it: texture by two anisotropic lookups along the line
 between the ends of the layer's interval, light with the normal of the interval's start.
 
-Before: shading.py.  After: resolve.py.  Only for `Accuracy.linear` and `Accuracy.adaptive`.
+Before: shading.py, shadows.py.  After: resolve.py.  Only for `Accuracy.linear` and `Accuracy.adaptive`.
 Symbols: L layers (an interval in a cell), J of them with texture or light.
 Source: Ronnow et al. 2021, sec. 4.4 and 5.1; the rule for the taps is that of EXT_texture_filter_anisotropic.
 """
@@ -15,7 +15,8 @@ from torchblur.cells import Cells
 from torchblur.intervals import Intervals
 from torchblur.lighting import reflected
 from torchblur.prisms import Prisms
-from torchblur.shading import Points, needing_points, points_on_prisms, position_and_normal, uv_slopes
+from torchblur.shading import Look, Points, needing_points, points_on_prisms, position_and_normal, uv_slopes
+from torchblur.shadows import visible_at
 from torchblur.surfaces import Surfaces
 from torchblur.texture import footprint, lookup
 
@@ -23,10 +24,8 @@ MAX_TAPS = 16  # of an anisotropic lookup
 INSET = 1e-6  # of an interval: places at its ends are looked up so far inside, where a face seen edge-on has one
 
 
-def look_over(
-    prisms: Prisms, intervals: Intervals, cells: Cells, layers: tuple[Tensor, Tensor]
-) -> tuple[Tensor, Tensor]:
-    """Return the mean straight colour (L, 3) and opacity (L,) of layers over their cells.
+def look_over(prisms: Prisms, intervals: Intervals, cells: Cells, layers: tuple[Tensor, Tensor]) -> Look:
+    """Return the mean look of layers over their cells, with the shadows of the cells' middles.
 
     Args:
         prisms: of the scene.
@@ -43,8 +42,9 @@ def look_over(
     face = prisms.face_of[intervals.prism[interval]]
     rgb, alpha = surfaces.rgb[face], surfaces.opacity[face]
     which = needing_points(surfaces, face)
+    direct = torch.zeros(len(face), 2, dtype=torch.float64, device=face.device)
     if len(which) == 0:
-        return rgb, alpha
+        return Look(rgb, alpha, direct)
     cell, interval = cell[which], interval[which]
     t_start, t_end = intervals.t_start[interval], intervals.t_end[interval]
     start, end = (
@@ -62,9 +62,12 @@ def look_over(
         (first, normal), (last, _) = (position_and_normal(surfaces, p, lit) for p in (start, end))
         middle = share.mean(0)[lit]
         t = 0.5 * (cells.t_start + cells.t_end)[cell[lit]]
-        light = reflected(surfaces, (1 - middle) * first + middle * last, normal, t)
+        point = (1 - middle) * first + middle * last
+        visible = visible_at(surfaces, point, t, start.face[lit])
+        light, own = reflected(surfaces, point, normal, t, visible)
         rgb = rgb.index_put((which[lit],), rgb[which[lit]] * light)
-    return rgb, alpha
+        direct = direct.index_put((which[lit],), own)
+    return Look(rgb, alpha, direct)
 
 
 def _two_lookups(surfaces: Surfaces, ends: tuple[Points, Points], share: Tensor, textured: Tensor) -> Tensor:

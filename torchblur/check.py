@@ -158,6 +158,13 @@ def number(name: str, value: Any, low: float = -math.inf, high: float = math.inf
     return float(value)
 
 
+def flag(name: str, value: Any) -> bool:
+    """Return `value`, which must be True or False."""
+    if not isinstance(value, bool):
+        raise fail_type(name, "True or False", value)
+    return value
+
+
 def same_device(**tensors: Tensor) -> torch.device:
     """Return the device that all the named tensors share."""
     found = {name: t.device for name, t in tensors.items()}

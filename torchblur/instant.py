@@ -17,6 +17,7 @@ from torchblur.camera import CENTRE, MAX_RAYS, Ray, clip_to_px, pixel_rays
 from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
 from torchblur.shading import Points, look, needing_points
+from torchblur.shadows import with_shadows
 from torchblur.surfaces import Surfaces, build_surfaces
 
 
@@ -68,7 +69,7 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
     for fragments in find_fragments(scene, surfaces, at, CENTRE):
-        _, alpha = _look(scene, surfaces, fragments)
+        alpha = look(surfaces, fragments.face, *_points(scene, surfaces, fragments)).alpha
         seen = (alpha.detach() > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
         first = seen[packed.offsets_from_counts(count)[:-1]]
@@ -168,16 +169,17 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
     for fragments in find_fragments(scene, surfaces, t, ray):
-        rgb, alpha = _look(scene, surfaces, fragments)
-        before, after = packed.transmittance(alpha, fragments.offsets)
-        light = (before * alpha).unsqueeze(1) * rgb
+        which, points = _points(scene, surfaces, fragments)
+        seen = look(surfaces, fragments.face, which, with_shadows(surfaces, points))
+        before, after = packed.transmittance(seen.alpha, fragments.offsets)
+        light = (before * seen.alpha).unsqueeze(1) * seen.rgb
         rgba = torch.cat([packed.sum_by_owner(light, fragments.offsets), (1 - after).unsqueeze(1)], dim=1)
         total = total + (rgba.reshape(-1, n_pixels, 4) * weight.unsqueeze(2)).sum(0)
     return total.reshape(camera.height, camera.width, 4)
 
 
-def _look(scene: Scene, surfaces: Surfaces, fragments: Fragments) -> tuple[Tensor, Tensor]:
-    """Return straight colour (n, 3) and opacity (n,) of the fragments."""
+def _points(scene: Scene, surfaces: Surfaces, fragments: Fragments) -> tuple[Tensor, Points]:
+    """Return which (J,) of the fragments need points, and these."""
     which = needing_points(surfaces, fragments.face)
     face, t = fragments.face[which], fragments.t[which]
     world = normal = fragments.bary.new_zeros(3, 3, 0)
@@ -185,7 +187,7 @@ def _look(scene: Scene, surfaces: Surfaces, fragments: Fragments) -> tuple[Tenso
         world, normal = _corners_world(scene, surfaces, face, t)
     mips = which if fragments.slope.shape[-1] else which[:0]
     one = torch.ones_like(t)
-    points = Points(
+    return which, Points(
         face=face,
         weight=fragments.bary[:, which],
         slope=fragments.slope[..., mips],
@@ -196,7 +198,6 @@ def _look(scene: Scene, surfaces: Surfaces, fragments: Fragments) -> tuple[Tenso
         side=fragments.side[which],
         t=t,
     )
-    return look(surfaces, fragments.face, which, points)
 
 
 def _corners_world(scene: Scene, surfaces: Surfaces, face: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein
+from torchblur.blocking import Receivers
 from torchblur.certificate import VECTOR_LIMIT, Divider
 from torchblur.lights import SpotLight
 from torchblur.paths import Paths
@@ -29,7 +30,10 @@ class LightPaths:
     """Normals and vectors to the lights of lit layers over spans."""
 
     paths: Paths  # K of them
-    normals: tuple[tuple[Tensor, Tensor], ...]  # which (n,) of the paths, (d + 1, 3, n) coefficients of N
+    place: Tensor  # (4, 3, K) coefficients of P
+    normals: tuple[
+        tuple[Tensor, Tensor], ...
+    ]  # of smooth and of flat faces: which (n,) of the paths, (d + 1, 3, n) coefficients of N
     vectors: tuple[Tensor, ...]  # (d + 1, 3, K) coefficients of V, light by light
     is_near: tuple[bool, ...]  # whether V holds S, light by light
 
@@ -47,7 +51,7 @@ class LightPaths:
         )
         lights = prisms.surfaces.lights
         vectors = tuple(light.path(place, paths.scale, paths.t) for light in lights)
-        return cls(paths, normals, vectors, tuple(len(v) > 2 for v in vectors))
+        return cls(paths, place, normals, vectors, tuple(len(v) > 2 for v in vectors))
 
     def bends(self, prisms: Prisms) -> tuple[Tensor, Tensor]:
         """Return the paths (B,) and times tau (B,) at which the light on them may bend."""
@@ -64,6 +68,30 @@ class LightPaths:
                     paths.append(of)
                     taus.append(tau)
         return torch.cat(paths), torch.cat(taus)
+
+    def receivers(self) -> Receivers:
+        """Return the points on the paths, as what light falls on."""
+        paths = self.paths
+        sign = paths.scale.mean(0).sign()  # of the face on screen
+        return Receivers(sign * self.place, sign * paths.scale, paths.t, paths.face)
+
+    def due(self, prisms: Prisms) -> tuple[Tensor, ...]:
+        """Return light by light (K,) bool: False where the path's surface faces away from it at all times."""
+        paths, handedness = self.paths, prisms.surfaces.handedness
+        sign_of_scale, parity = paths.scale.mean(0).sign(), prisms.parity[paths.prism]
+        found = []
+        for vector, is_near in zip(self.vectors, self.is_near, strict=True):
+            is_away = torch.zeros_like(paths.span, dtype=torch.bool)
+            for is_smooth, (which, normal) in zip((True, False), self.normals, strict=True):
+                side = torch.full_like(parity[which], handedness)  # see shading.position_and_normal
+                if is_smooth:  # N holds S; a flat one holds the turn of the stored corners
+                    side = side * parity[which]
+                if is_smooth == is_near:
+                    side = side * sign_of_scale[which]
+                cosine = side * bernstein.product(normal, vector[..., which]).sum(1)
+                is_away[which] = (cosine <= 0).all(0)
+            found.append(~is_away)
+        return tuple(found)
 
     def dividers(self, prisms: Prisms) -> list[Divider]:
         """Return what the light on the paths divides by. Within the border of a cone vectors may vary by less, as the

@@ -29,6 +29,7 @@ class PointLight:
     Args:
         position: (3,) or (K+1, 3) floats at equally spaced shutter times [scene units].
         intensity: a number or (3,) linear RGB, at least 0 [W/sr].
+        casts_shadows: whether faces between it and a lit point take its light away.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -36,10 +37,12 @@ class PointLight:
 
     position: Any
     intensity: Any
+    casts_shadows: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _moving("position", self.position))
         object.__setattr__(self, "intensity", _rgb("intensity", self.intensity))
+        check.flag("casts_shadows", self.casts_shadows)
 
     @property
     def knots(self) -> list[float]:
@@ -82,6 +85,7 @@ class SpotLight:
         inner_angle_deg, outer_angle_deg: from the axis [degrees], 0 <= inner <= outer, 0.01 <= outer <= 90; between
             them the light falls by the square of a linear function of the angle's cosine; equal angles are a hard
             border, through which no gradient passes.
+        casts_shadows: as for `PointLight`.
 
     Raises:
         TypeError, ValueError: a wrong argument, named; a target at the position.
@@ -92,11 +96,13 @@ class SpotLight:
     intensity: Any
     inner_angle_deg: float = field(default=30.0, kw_only=True)
     outer_angle_deg: float = field(default=45.0, kw_only=True)
+    casts_shadows: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", _moving("position", self.position))
         object.__setattr__(self, "target", _moving("target", self.target))
         object.__setattr__(self, "intensity", _rgb("intensity", self.intensity))
+        check.flag("casts_shadows", self.casts_shadows)
         check.number("outer_angle_deg", self.outer_angle_deg, LEAST_ANGLE_DEG, 90.0)
         check.number("inner_angle_deg", self.inner_angle_deg, 0.0, self.outer_angle_deg)
         times = torch.tensor([0.0, *self.knots, 1.0], dtype=torch.float64, device=self.position.device)
@@ -145,6 +151,7 @@ class DirectionalLight:
     Args:
         direction: (3,) or (K+1, 3) floats, the way the light travels, of any length above 0.
         irradiance: a number or (3,) linear RGB, at least 0, of a surface that faces the light [W/m^2].
+        casts_shadows: as for `PointLight`.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -152,10 +159,12 @@ class DirectionalLight:
 
     direction: Any
     irradiance: Any
+    casts_shadows: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "direction", _moving("direction", self.direction))
         object.__setattr__(self, "irradiance", _rgb("irradiance", self.irradiance))
+        check.flag("casts_shadows", self.casts_shadows)
         if (self.direction.detach() == 0).all(-1).any():
             raise check.fail("direction", "a vector that is not 0", "a vector of zeros")
 

@@ -52,8 +52,7 @@ class Material:
             raise check.fail("color", "values of at least 0", f"{float(color.detach().min())}")
         opacity = check.unit_range("opacity", check.floats("opacity", self.opacity, (), ("F",)))
         for name in ("double_sided", "mipmap"):
-            if not isinstance(getattr(self, name), bool):
-                raise check.fail_type(name, "True or False", getattr(self, name))
+            check.flag(name, getattr(self, name))
         for name, known in (("wrap", WRAPS), ("shading", SHADINGS)):
             if getattr(self, name) not in known:
                 raise check.fail(name, " or ".join(known), getattr(self, name))

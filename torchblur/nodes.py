@@ -9,7 +9,7 @@ Source: Gauss-Legendre quadrature; ours.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -21,9 +21,10 @@ from torchblur.cells import Cells
 from torchblur.certificate import SCALE_LIMIT, VECTOR_LIMIT, Divider, nodes_needed
 from torchblur.intervals import Intervals
 from torchblur.light_bends import LightPaths
-from torchblur.paths import Paths, between, cut_spans, follow
+from torchblur.paths import Paths, cut_spans, follow
 from torchblur.prisms import Prisms
-from torchblur.sort import argsort_by
+from torchblur.shadows import Shadows, find_shadows
+from torchblur.sort import argsort_by, between
 from torchblur.surfaces import Surfaces
 from torchblur.texture_bends import TexturePaths
 
@@ -45,6 +46,8 @@ class Samples:
     t: Tensor  # (S,) float64 shutter time
     share: Tensor  # (S,) float64 of the cell's length that the sample stands for
     is_flat: Tensor  # (S,) bool: stands for its whole cell, in which nothing changes
+    span: Tensor  # (S,) int64 the span in which it lies; 0 where flat
+    tau: Tensor  # (S,) float64 share of the span
 
 
 @dataclass(frozen=True)
@@ -59,13 +62,31 @@ class Varying:
     which_textured: Tensor  # which of the paths
     lit: LightPaths
     which_lit: Tensor
+    shadows: Shadows | None = None  # of the lit paths, once they have been found
+
+    def lit_paths_of(self, cells: Cells, is_varying: Tensor, layer: Tensor, span: Tensor) -> Tensor:
+        """Return which of the lit paths layers are on over spans, -1 for none.
+
+        Args:
+            cells: in which the layers are.
+            is_varying: (L,) of all layers in the cells, whether their look depends on time.
+            layer: (n,) in the cell of
+            span: (n,).
+        """
+        before = packed.offsets_from_counts(is_varying.long())
+        rank = before[layer] - before[cells.layer_offsets[self.cell[span]]]
+        path = packed.offsets_from_owners(self.paths.span, len(self.cell))[span] + rank
+        lit = torch.full((len(self.paths.span) + 1,), -1, dtype=torch.int64, device=span.device)
+        lit[self.which_lit] = torch.arange(len(self.which_lit), device=span.device)
+        return torch.where(is_varying[layer], lit[path], -1)
 
 
 def middle_samples(cells: Cells) -> Samples:
     """Return one sample for each cell, in its middle: exact where nothing changes within cells. Source: ours."""
     every = torch.arange(len(cells.t_start), device=cells.t_start.device)
     middle = 0.5 * (cells.t_start + cells.t_end)
-    return Samples(every, middle, torch.ones_like(middle), torch.ones_like(every, dtype=torch.bool))
+    one = torch.ones_like(middle)
+    return Samples(every, middle, one, torch.ones_like(every, dtype=torch.bool), torch.zeros_like(every), 0.5 * one)
 
 
 @torch.no_grad()
@@ -102,6 +123,15 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
 
 
 @torch.no_grad()
+def add_shadows(prisms: Prisms, varying: Varying | None) -> Varying | None:
+    """Return what varies with the shadows on it, where there are any. Source: ours."""
+    if varying is None or prisms.surfaces.casters is None or len(varying.which_lit) == 0:
+        return varying
+    lit = varying.lit
+    return replace(varying, shadows=find_shadows(prisms.surfaces, lit.receivers(), lit.due(prisms)))
+
+
+@torch.no_grad()
 def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> Tensor:
     """Return about how much memory the samples of each pixel (pixels,) take at their peak [bytes]. Source: ours."""
     n_layers = cells.layer_offsets.diff().to(torch.float64)
@@ -114,6 +144,9 @@ def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> Ten
         panels = torch.ones_like(varying.start).index_add(0, varying.textured.paths.span, lines)
         nodes = torch.full_like(panels, FEW)
         nodes[varying.lit.paths.span] = FEW_LIT
+        if varying.shadows is not None:
+            which, _ = varying.shadows.ends(surfaces)
+            panels = panels + torch.bincount(varying.lit.paths.span[which], minlength=len(panels))
         of_cell = n_layers * BYTES_PER_LAYER
         of_cell = of_cell.index_add(0, varying.cell, panels * nodes * n_layers[varying.cell] * BYTES_PER_LOOK)
     return packed.sum_by_owner(of_cell, cells.offsets)
@@ -164,20 +197,22 @@ def place_samples(prisms: Prisms, cells: Cells, varying: Varying | None) -> Samp
         owners.append(owner[chosen].repeat(n))
         taus.append((start[chosen] + length * (0.5 * (place.unsqueeze(1) + 1))).flatten())
         shares.append((length * (0.5 * weight.unsqueeze(1))).flatten())
-    span, tau, share = torch.cat(owners), torch.cat(taus), torch.cat(shares)
+    span, within, share = torch.cat(owners), torch.cat(taus), torch.cat(shares)
     length = varying.end - varying.start
     is_varying = torch.zeros(len(cells.t_start), dtype=torch.bool, device=device)
     is_varying[varying.cell] = True
     rest = (~is_varying).nonzero().flatten()
     one = torch.ones(len(rest), dtype=torch.float64, device=device)
     owner = torch.cat([varying.cell[span], rest])
-    tau = torch.cat([varying.start[span] + tau * length[span], 0.5 * one])
+    tau = torch.cat([varying.start[span] + within * length[span], 0.5 * one])
     share = torch.cat([share * length[span], one])
     order = argsort_by(owner, tau)
+    within = torch.cat([within, 0.5 * one])[order]
+    span = torch.cat([span, torch.zeros_like(rest)])[order]
     owner, tau, share = owner[order], tau[order], share[order]
     with torch.enable_grad():
         t = (1 - tau) * cells.t_start[owner] + tau * cells.t_end[owner]
-    return Samples(owner, t, share, ~is_varying[owner])
+    return Samples(owner, t, share, ~is_varying[owner], span, within)
 
 
 @cache
@@ -194,6 +229,10 @@ def _cut_panels(prisms: Prisms, varying: Varying) -> tuple[Tensor, Tensor, Tenso
         inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
         owners.append(curves.paths.span[which[inside]])
         taus.append(tau[inside])
+    if varying.shadows is not None:
+        which, tau = varying.shadows.ends(prisms.surfaces)
+        owners.append(varying.lit.paths.span[which])
+        taus.append(tau)
     return between(torch.cat(owners), torch.cat(taus))
 
 

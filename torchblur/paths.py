@@ -19,9 +19,7 @@ from torchblur.cells import Cells
 from torchblur.edges import Corners
 from torchblur.intervals import Intervals
 from torchblur.prisms import Prisms
-from torchblur.sort import argsort_by
-
-SAME_TIME = 1e-12  # of the cell
+from torchblur.sort import between
 
 
 @dataclass(frozen=True)
@@ -113,14 +111,6 @@ def _slices(cells: Cells, cell: Tensor, times: list[Tensor]) -> tuple[Tensor, Te
         owners.append(inside)
         taus.append(tau[inside])
     return between(torch.cat(owners), torch.cat(taus))
-
-
-def between(owner: Tensor, tau: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the owner, start and end of the slices between the times `tau` (n,) of each `owner` (n,). Ours."""
-    order = argsort_by(owner, tau)
-    owner, tau = owner[order], tau[order]
-    real = ((owner[1:] == owner[:-1]) & (tau[1:] - tau[:-1] > SAME_TIME)).nonzero().flatten()
-    return owner[real], tau[real], tau[real + 1]
 
 
 def follow(prisms: Prisms, intervals: Intervals, cells: Cells, spans: Spans) -> Paths:

@@ -6,10 +6,8 @@ Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -21,7 +19,8 @@ from torchblur.cells import count_layers, cut_cells
 from torchblur.effects import EffectPlan, agree_plan, check_effects, follow_plan, plan_prisms
 from torchblur.hidden import find_visible_intervals
 from torchblur.intervals import Intervals
-from torchblur.nodes import estimate_bytes, estimate_path_bytes, find_varying, place_samples
+from torchblur.ledger import Ledger
+from torchblur.nodes import add_shadows, estimate_bytes, estimate_path_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.paths import cut_at_knots
 from torchblur.prisms import Prisms, build_prisms
@@ -34,9 +33,7 @@ from torchblur.survey import Survey, survey_prisms
 
 BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 MIN_MEMORY_BYTES = 1 << 20
-COUNTS = ("prisms", "blocks", "pairs", "still_pairs", "hidden_pairs", "intervals", "cells", "layers", "crossings")
-COUNTS += ("nodes", "deepest_pixel")
-STAGES = ("prisms", "plan", "intervals", "cells", "nodes", "resolve")
+N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
 
 
 @dataclass(frozen=True)
@@ -45,31 +42,13 @@ class Frame:
 
     rgba: Tensor  # (H, W, 4) linear: RGB is what the pixel sees, background included; A the meshes' mean opacity
     coverage: Tensor  # (H, W, M) share of the shutter's window in which each mesh is visible at the pixel
-    counts: dict[str, int]  # how many of COUNTS
-    timings: dict[str, float]  # seconds in each of STAGES
+    shadow: (
+        Tensor | None
+    )  # (H, W) share of the direct light due to what the pixel sees that no shadow takes away; 1 where
+    # none is due; None where no light of the scene casts shadows on anything
+    counts: dict[str, int]  # how many of ledger.COUNTS
+    timings: dict[str, float]  # seconds in each of ledger.STAGES
     plan: EffectPlan  # which effects were simulated, and why
-
-
-@dataclass
-class _Ledger:
-    """What was done so far."""
-
-    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(COUNTS, 0))
-    timings: dict[str, float] = field(default_factory=lambda: dict.fromkeys(STAGES, 0.0))
-
-    def add(self, name: str, n: int) -> None:
-        self.counts[name] += int(n)
-
-    def deepest(self, name: str, n: int) -> None:
-        self.counts[name] = max(self.counts[name], int(n))
-
-    @contextmanager
-    def stage(self, name: str, device: torch.device) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        if device.type == "cuda":
-            torch.cuda.synchronize(device)
-        self.timings[name] += time.perf_counter() - start
 
 
 def render(
@@ -97,7 +76,7 @@ def render(
             that needs more gets it.
 
     Returns:
-        A frame with `rgba` (H, W, 4), `coverage` (H, W, M), counts, timings and the plan.
+        A frame with `rgba` (H, W, 4), `coverage` (H, W, M), `shadow` (H, W) or None, counts, timings and the plan.
 
     Raises:
         TypeError, ValueError: a wrong argument, named.
@@ -181,7 +160,7 @@ def _checked_job(
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
     if check.positive_int("memory_bytes", memory_bytes) < MIN_MEMORY_BYTES:
         raise check.fail("memory_bytes", f"at least {MIN_MEMORY_BYTES}", memory_bytes)
-    return _Job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes, _Ledger())
+    return _Job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes, Ledger())
 
 
 @dataclass(frozen=True)
@@ -204,7 +183,7 @@ class _Job:
     effects: str | EffectPlan
     rays_per_pixel: int
     memory_bytes: int
-    ledger: _Ledger
+    ledger: Ledger
 
     def frames(self) -> list[Frame]:
         """Return a frame for each shutter."""
@@ -223,18 +202,22 @@ class _Job:
                 prisms, survey, chosen = follow_plan(plan, prisms, survey, self.accuracy)
             work = _Work(plan, prisms, survey, chosen)
             total = sum(self._image(work, ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
-            return [self._frame(image, plan) for image in total]
+            return [self._frame(image, plan, surfaces.casters is not None) for image in total]
 
-    def _frame(self, image: Tensor, plan: EffectPlan) -> Frame:
-        """Return the frame of (H, W, 4 + M) premultiplied colour, alpha and coverage."""
+    def _frame(self, image: Tensor, plan: EffectPlan, has_shadows: bool) -> Frame:
+        """Return the frame of (H, W, N_LOOKS + M) looks and coverage."""
         scene = self.scene
-        rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., 4:]
+        rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., N_LOOKS:]
+        due, arriving = image[..., 4:N_LOOKS].unbind(-1)
+        is_due = due > 0
+        shadow = torch.where(is_due, arriving / torch.where(is_due, due, 1.0), 1.0).to(scene.dtype)
         for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
-        return Frame(rgba, coverage.to(scene.dtype), self.ledger.counts, self.ledger.timings, plan)
+        shadow = shadow if has_shadows else None
+        return Frame(rgba, coverage.to(scene.dtype), shadow, self.ledger.counts, self.ledger.timings, plan)
 
     def _image(self, work: _Work, ray: Ray) -> Tensor:
-        """Return (shutters, H, W, 4 + M) float64: premultiplied colour, alpha and coverage for one ray per pixel."""
+        """Return (shutters, H, W, N_LOOKS + M) float64: looks and coverage for one ray per pixel."""
         camera, device = self.scene.camera, self.scene.device
         whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
         prisms, accuracy = work.prisms, self.accuracy
@@ -256,14 +239,14 @@ class _Job:
                 column, row = block.x0 + pixels % block.width, block.y0 + pixels // block.width
                 places.append(row * camera.width + column)
                 values.append(self._resolve(work, intervals.of_pixels(pixels), (column, row)))
-        n_pixels, n_channels = camera.height * camera.width, 4 + len(self.scene.meshes)
+        n_pixels, n_channels = camera.height * camera.width, N_LOOKS + len(self.scene.meshes)
         image = torch.zeros(n_pixels, len(self.shutters), n_channels, dtype=torch.float64, device=device)
         if places:
             image = image.index_put((torch.cat(places),), torch.cat(values))
         return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
 
     def _resolve(self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], whole: bool = True) -> Tensor:
-        """Return (pixels, shutters, 4 + M) of the pixels at column and row `pixel`, if `whole` in portions that fit."""
+        """Return (pixels, shutters, N_LOOKS + M) of the pixels at column and row `pixel`, in portions that fit."""
         camera, device = self.scene.camera, self.scene.device
         prisms, (column, row) = work.prisms, pixel
         is_exact = self.accuracy.method == "exact"
@@ -275,10 +258,14 @@ class _Job:
             varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
             n_bytes = estimate_bytes(prisms, cells, varying)
         if whole and float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
-            parts = []
-            for chosen in _portions(n_bytes, self.memory_bytes):
-                parts.append(self._resolve(work, intervals.of_pixels(chosen), (column[chosen], row[chosen]), False))
-            return torch.cat(parts)
+            return self._in_portions(work, intervals, pixel, n_bytes)
+        if varying is not None and prisms.surfaces.casters is not None:
+            with self.ledger.stage("shadows", device):
+                varying = add_shadows(prisms, varying)
+                n_bytes = estimate_bytes(prisms, cells, varying)
+            if float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
+                return self._in_portions(work, intervals, pixel, n_bytes)
+            self.ledger.add_shadows(varying.shadows)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
         self.ledger.add("crossings", cells.n_crossings)
@@ -288,13 +275,21 @@ class _Job:
         with self.ledger.stage("resolve", device):
             pixel_of = packed.owners(cells.offsets)[samples.cell]
             offsets = packed.offsets_from_owners(pixel_of, len(column))
-            composite = composite_samples(prisms, intervals, cells, samples, self.accuracy)
+            composite = composite_samples(prisms, intervals, cells, samples, self.accuracy, varying)
             parts = []
             for shutter, line in zip(self.shutters, lines, strict=True):
                 weight = weigh_samples(shutter, cells, samples, line[pixel_of])
                 done = expose_samples(offsets, composite, weight, len(self.scene.meshes))
-                parts.append(torch.cat([done.premultiplied, done.alpha.unsqueeze(1), done.coverage], dim=1))
+                parts.append(torch.cat([done.rgba, done.light, done.coverage], dim=1))
             return torch.stack(parts, dim=1)
+
+    def _in_portions(self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], n_bytes: Tensor) -> Tensor:
+        """Return what `_resolve` does, portion by portion of pixels that take `n_bytes` (pixels,) each."""
+        parts = []
+        for chosen in _portions(n_bytes, self.memory_bytes):
+            own = tuple(place[chosen] for place in pixel)
+            parts.append(self._resolve(work, intervals.of_pixels(chosen), own, False))
+        return torch.cat(parts)
 
     def _knots(self, lines: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the times (J,) at which the shutters bend, and by how much lines delay them (J, pixels)."""

@@ -18,9 +18,10 @@ from torchblur.accuracy import Accuracy
 from torchblur.averages import look_over
 from torchblur.cells import Cells
 from torchblur.intervals import Intervals
-from torchblur.nodes import Samples
+from torchblur.nodes import Samples, Varying
 from torchblur.prisms import Prisms
 from torchblur.shading import look, needing_points, points_on_prisms
+from torchblur.shadows import with_shadows
 from torchblur.shutter import Shutter
 
 
@@ -29,6 +30,7 @@ class Composite:
     """What each sample shows, however long it is seen."""
 
     rgba: Tensor  # (S, 4) float64 premultiplied linear colour and opacity of the meshes
+    light: Tensor  # (S, 2) float64 direct light that visible surfaces would get without shadows, and that they get
     seen_sample: Tensor  # (V,) int64 samples, once for each mesh that is visible in them
     seen_mesh: Tensor  # (V,) int64
 
@@ -37,13 +39,18 @@ class Composite:
 class Resolved:
     """The mean over the exposure for each pixel of a block."""
 
-    premultiplied: Tensor  # (pixels, 3) float64 linear colour of the meshes alone
-    alpha: Tensor  # (pixels,) float64 their mean opacity
+    rgba: Tensor  # (pixels, 4) float64 premultiplied linear colour and opacity of the meshes alone
+    light: Tensor  # (pixels, 2) float64 direct light that visible surfaces would get without shadows, and that they get
     coverage: Tensor  # (pixels, M) float64 share of the exposure in which each mesh is visible
 
 
 def composite_samples(
-    prisms: Prisms, intervals: Intervals, cells: Cells, samples: Samples, accuracy: Accuracy
+    prisms: Prisms,
+    intervals: Intervals,
+    cells: Cells,
+    samples: Samples,
+    accuracy: Accuracy,
+    varying: Varying | None = None,
 ) -> Composite:
     """Return what every sample shows, front to back.
 
@@ -52,6 +59,7 @@ def composite_samples(
         intervals: from which the cells were cut.
         cells: with layers nearest first.
         samples: of the cells.
+        varying: what varies in the cells, with the shadows on it; None if nothing does.
         accuracy: whether layers are looked at at the samples' times, or on average over the cells; where rays end.
 
     Accuracy: exactly, opacities are multiplied at each time, never their means; else see `Accuracy`.
@@ -66,15 +74,22 @@ def composite_samples(
     if accuracy.method == "exact":
         which = needing_points(surfaces, face)
         points = points_on_prisms(prisms, intervals, interval[which], samples.t[sample[which]])
-        rgb, alpha = look(surfaces, face, which, points)
+        known = None
+        if varying is not None and varying.shadows is not None:
+            is_varying = surfaces.is_varying[prisms.face_of[intervals.prism[cells.layer_interval]]]
+            paths = varying.lit_paths_of(cells, is_varying, layer[which], samples.span[sample[which]])
+            known = varying.shadows, paths, samples.tau[sample[which]]
+        seen = look(surfaces, face, which, with_shadows(surfaces, points, known))
     else:
-        rgb, alpha = look_over(prisms, intervals, cells, (samples.cell[sample], interval))
-    before, after = packed.transmittance(alpha, offsets, accuracy.transmittance_cutoff)
-    light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
+        seen = look_over(prisms, intervals, cells, (samples.cell[sample], interval))
+    before, after = packed.transmittance(seen.alpha, offsets, accuracy.transmittance_cutoff)
+    weight = (before * seen.alpha).unsqueeze(1)
+    light = packed.sum_by_owner(weight * torch.cat([seen.rgb, seen.light], dim=1), offsets)
     n_meshes = max(1, len(surfaces.first_face))
-    visible = ((before.detach() > 0) & (alpha.detach() > 0)).nonzero().flatten()
-    seen = torch.unique(sample[visible] * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once
-    return Composite(torch.cat([light, (1 - after).unsqueeze(1)], dim=1), seen // n_meshes, seen % n_meshes)
+    visible = ((before.detach() > 0) & (seen.alpha.detach() > 0)).nonzero().flatten()
+    pairs = torch.unique(sample[visible] * n_meshes + surfaces.mesh_of[face[visible]])  # a mesh counts once
+    rgba = torch.cat([light[:, :3], (1 - after).unsqueeze(1)], dim=1)
+    return Composite(rgba, light[:, 3:], pairs // n_meshes, pairs % n_meshes)
 
 
 def weigh_samples(shutter: Shutter, cells: Cells, samples: Samples, line: Tensor) -> Tensor:
@@ -108,8 +123,9 @@ def expose_samples(offsets: Tensor, composite: Composite, weight: Tensor, n_mesh
     Gradient: through composite and weight.
     Source: the rendering integral of Ronnow et al. 2021, sec. 3.
     """
-    rgba = packed.sum_by_owner(weight.unsqueeze(1) * composite.rgba, offsets)
+    values = torch.cat([composite.rgba, composite.light], dim=1)
+    means = packed.sum_by_owner(weight.unsqueeze(1) * values, offsets)
     n_pixels = len(offsets) - 1
     target = packed.owners(offsets)[composite.seen_sample] * n_meshes + composite.seen_mesh
     coverage = weight.new_zeros(n_pixels * n_meshes).index_add(0, target, weight[composite.seen_sample])
-    return Resolved(rgba[:, :3], rgba[:, 3], coverage.reshape(n_pixels, n_meshes))
+    return Resolved(means[:, :4], means[:, 4:], coverage.reshape(n_pixels, n_meshes))

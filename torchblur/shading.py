@@ -23,6 +23,15 @@ OPAQUE = 1e-14  # rounding of an interpolated opacity of 1
 
 
 @dataclass(frozen=True)
+class Look:
+    """What K points look like."""
+
+    rgb: Tensor  # (K, 3) straight colour
+    alpha: Tensor  # (K,) opacity
+    light: Tensor  # (K, 2) direct light that were there without shadows, and that is there; 0 on what is not lit
+
+
+@dataclass(frozen=True)
 class Points:
     """Points on faces that have texture or light; corners in any order, the same in all fields."""
 
@@ -35,6 +44,7 @@ class Points:
     turn: Tensor  # (J,) +1 where the corners are in the face's order, else -1
     side: Tensor  # (J,) +1 where the face turns counter-clockwise on screen, else -1
     t: Tensor  # (J,) shutter time
+    visible: Tensor | None = None  # (lights, J) share of each light that reaches the points; all of it if None
 
 
 def needing_points(surfaces: Surfaces, face: Tensor) -> Tensor:
@@ -42,8 +52,8 @@ def needing_points(surfaces: Surfaces, face: Tensor) -> Tensor:
     return (surfaces.is_textured | surfaces.is_lit)[face].nonzero().flatten()
 
 
-def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tuple[Tensor, Tensor]:
-    """Return straight colour (K, 3) and opacity (K,) of points on `face` (K,).
+def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> Look:
+    """Return the look of points on `face` (K,).
 
     Args:
         surfaces: appearance of the faces.
@@ -55,8 +65,9 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tup
     Source: ours.
     """
     rgb, alpha = surfaces.rgb[face], surfaces.opacity[face]
+    direct = torch.zeros(len(face), 2, dtype=torch.float64, device=face.device)
     if len(which) == 0:
-        return rgb, alpha
+        return Look(rgb, alpha, direct)
     textured = surfaces.is_textured[points.face].nonzero().flatten()
     if len(textured):
         of, own = which[textured], points.face[textured]
@@ -71,9 +82,11 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> tup
         alpha = alpha.index_put((of,), alpha[of] * opacity)
     lit = surfaces.is_lit[points.face].nonzero().flatten()
     if len(lit):
-        light = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit])
+        visible = None if points.visible is None else points.visible[:, lit]
+        light, own = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit], visible)
         rgb = rgb.index_put((which[lit],), rgb[which[lit]] * light)
-    return rgb, alpha
+        direct = direct.index_put((which[lit],), own)
+    return Look(rgb, alpha, direct)
 
 
 def points_on_prisms(prisms: Prisms, intervals: Intervals, interval: Tensor, t: Tensor) -> Points:

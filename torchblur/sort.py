@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+SAME_TIME = 1e-12  # of the owner's time
 TIE = 1e-11  # relative: nearness of surfaces that count as coplanar (float64 rounding, with room for thin triangles)
 
 
@@ -69,3 +70,11 @@ def reorder_ties(order: Tensor, tied_to_previous: Tensor, rank: Tensor) -> Tenso
         return order
     group = torch.cumsum((~tied_to_previous).long(), dim=0)
     return order[argsort_by(group, rank[order])]
+
+
+def between(owner: Tensor, tau: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the owner, start and end of the slices between the times `tau` (n,) of each `owner` (n,). Ours."""
+    order = argsort_by(owner, tau)
+    owner, tau = owner[order], tau[order]
+    real = ((owner[1:] == owner[:-1]) & (tau[1:] - tau[:-1] > SAME_TIME)).nonzero().flatten()
+    return owner[real], tau[real], tau[real + 1]

@@ -1,6 +1,6 @@
 """What the faces of a scene look like, all meshes end to end, and which of two coplanar ones is in front.
 
-Before: scene.py, atlas.py.  After: prisms.py, fragments.py, texture.py.
+Before: scene.py, atlas.py, casters.py.  After: prisms.py, fragments.py, texture.py.
 Symbols: F faces of all meshes.
 """
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchblur.atlas import Atlas, build_atlas
+from torchblur.casters import Casters, find_casters
 from torchblur.lights import Light
 from torchblur.scene import Mesh, Scene
 
@@ -35,6 +36,7 @@ class Surfaces:
     is_lit: Tensor  # (F,) bool: shows its colour times the light that it gets
     has_normals: Tensor  # (F,) bool: its corners have normals; otherwise it is flat
     lights: tuple[Light, ...]
+    casters: Casters | None  # what casts shadows; None where nothing does, on nothing
     ambient: Tensor  # (3,) float64 radiance from everywhere
     handedness: float  # of the camera
     first_face: tuple[int, ...]  # index of the first face of each mesh
@@ -66,9 +68,11 @@ def build_surfaces(scene: Scene) -> Surfaces:
 
     is_opaque = (opacity.detach() == 1) & ~per_face(varies)
     lights_move = any(p.ndim == 2 for light in scene.lights for p in light.tensors().values())
+    casters = find_casters(scene)
+    light_changes = lights_move or (casters is not None and casters.moves)
     varying = [
         (m.material.texture is not None and not scene.is_still(m))
-        or (m.material.shading == "lambert" and bool(scene.lights) and (lights_move or not scene.is_still(m)))
+        or (m.material.shading == "lambert" and bool(scene.lights) and (light_changes or not scene.is_still(m)))
         for m in meshes
     ]
     return Surfaces(
@@ -86,6 +90,7 @@ def build_surfaces(scene: Scene) -> Surfaces:
         is_lit=per_face([m.material.shading == "lambert" for m in meshes]),
         has_normals=per_face([m.normals is not None for m in meshes]),
         lights=scene.lights,
+        casters=casters,
         ambient=scene.ambient.to(device, f64),
         handedness=scene.camera.handedness,
         first_face=first,

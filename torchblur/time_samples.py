@@ -1,6 +1,6 @@
 """Samples in time: looks at a scene at times and places that every pixel has for itself.
 
-Before: prisms.py, edges.py, shading.py.  After: sampling.py.
+Before: prisms.py, edges.py, shading.py, shadows.py.  After: sampling.py.
 Symbols: N samples a pixel, P pixels of some rows of the image; m pairs of a prism and a ray. The samples of a pixel are
 in the order of their times; those of one rank in all pixels, which lie in a short slice of the exposure, are done
 together, so that a triangle meets only the pixels that it sweeps over in that slice.
@@ -21,6 +21,7 @@ from torchblur.camera import Ray
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.scene import Scene
 from torchblur.shading import Points, look, needing_points, weight_slopes
+from torchblur.shadows import with_shadows
 from torchblur.shutter import Shutter
 from torchblur.sort import argsort_by, is_tied, reorder_ties
 from torchblur.surfaces import Surfaces
@@ -170,10 +171,10 @@ def _see(scene: Scene, surfaces: Surfaces, rays: _Rays) -> Tensor:
         side=side[which],
         t=rays.t[pixel[which]],
     )
-    rgb, alpha = look(surfaces, face, which, points)
+    seen = look(surfaces, face, which, with_shadows(surfaces, points))
     offsets = packed.offsets_from_owners(pixel, len(rays.t))
-    before, after = packed.transmittance(alpha, offsets)
-    light = packed.sum_by_owner((before * alpha).unsqueeze(1) * rgb, offsets)
+    before, after = packed.transmittance(seen.alpha, offsets)
+    light = packed.sum_by_owner((before * seen.alpha).unsqueeze(1) * seen.rgb, offsets)
     return torch.cat([light, (1 - after).unsqueeze(1)], dim=1)
 
 

@@ -257,14 +257,14 @@ class _Job:
         with self.ledger.stage("nodes", device):
             varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
             n_bytes = estimate_bytes(prisms, cells, varying)
-        if whole and float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
-            return self._in_portions(work, intervals, pixel, n_bytes)
+        if whole and len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
+            return self._in_portions(work, intervals, pixel, portions)
         if varying is not None and prisms.surfaces.casters is not None:
             with self.ledger.stage("shadows", device):
                 varying = add_shadows(prisms, varying)
                 n_bytes = estimate_bytes(prisms, cells, varying)
-            if float(n_bytes.sum()) > self.memory_bytes and len(column) > 1:
-                return self._in_portions(work, intervals, pixel, n_bytes)
+            if len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
+                return self._in_portions(work, intervals, pixel, portions)
             self.ledger.add_shadows(varying.shadows)
         self.ledger.add("cells", len(cells.t_start))
         self.ledger.add("layers", len(cells.layer_interval))
@@ -283,10 +283,12 @@ class _Job:
                 parts.append(torch.cat([done.rgba, done.light, done.coverage], dim=1))
             return torch.stack(parts, dim=1)
 
-    def _in_portions(self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], n_bytes: Tensor) -> Tensor:
-        """Return what `_resolve` does, portion by portion of pixels that take `n_bytes` (pixels,) each."""
+    def _in_portions(
+        self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], portions: Sequence[Tensor]
+    ) -> Tensor:
+        """Return what `_resolve` does, portion by portion of the pixels."""
         parts = []
-        for chosen in _portions(n_bytes, self.memory_bytes):
+        for chosen in portions:
             own = tuple(place[chosen] for place in pixel)
             parts.append(self._resolve(work, intervals.of_pixels(chosen), own, False))
         return torch.cat(parts)

@@ -24,6 +24,7 @@ from torchblur.prisms import swept_bounds_px
 
 FINEST = 10  # level
 AT_ONCE = 1 << 15  # pairs looked at together: 30 MB, which caches hold in part
+FEW_PAIRS = 1 << 17  # below, all pairs are looked at; cells would take longer
 SIDE = 2  # [-1, 1] is how wide the side of a cube is, from 0 to 2 in the units of `swept_bounds_px`
 NEAR = 1e-12  # of the casters' extent: nothing is nearer to a light
 SLACK = 1e-9  # of the casters' extent: widening of bounds against rounding
@@ -48,8 +49,21 @@ def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Ite
     lie on a border between sides of the cube, more than once. Source: ours.
     """
     views = _directional_views if isinstance(light, DirectionalLight) else _cube_views
+    kept: list[tuple[Tensor, Tensor]] = []
     for receiver, caster in views(light, receivers, casters):
-        yield from _join(receiver, caster, receivers, casters)
+        for pairs in _join(receiver, caster, receivers, casters):
+            kept.append(pairs)
+            if sum(len(r) for r, _ in kept) >= AT_ONCE:
+                yield _together(kept)
+                kept = []
+    if kept:
+        yield _together(kept)
+
+
+def _together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+    """Return pairs end to end."""
+    r, c = (torch.cat(p) for p in zip(*parts, strict=True))
+    return r, c
 
 
 def _cube_views(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[_Swept, _Swept]]:
@@ -145,18 +159,29 @@ def _raised(coefficients: Tensor, length: int) -> Tensor:
 def _join(receiver: _Swept, caster: _Swept, receivers: Receivers, casters: Casters) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield the pairs of a view whose rectangles, depths and times overlap."""
     receiver, caster = _in_common_box(receiver, caster)
+    for a, b, meeting in _meetings(receiver, caster):
+        for i, j in meeting:
+            near = (a.low[:, i] <= b.high[:, j]).all(0) & (b.low[:, j] <= a.high[:, i]).all(0)
+            near &= b.depth[j] <= a.depth[i]
+            r, c = a.which[i[near]], b.which[j[near]]
+            together = _share_time(receivers, casters, r, c) & (receivers.face[r] != casters.face[c])
+            if together.any():
+                yield r[together], c[together]
+
+
+def _meetings(receiver: _Swept, caster: _Swept) -> Iterator[tuple[_Swept, _Swept, Iterator[tuple[Tensor, Tensor]]]]:
+    """Yield parts of both, with the pairs of places in these that may overlap: all of them where there are few."""
+    n, m = len(receiver.which), len(caster.which)
+    if n * m <= FEW_PAIRS:
+        every = torch.arange(n * m, device=receiver.which.device)
+        yield receiver, caster, iter([(every // max(m, 1), every % max(m, 1))])
+        return
     levels = [_level(thing) for thing in (receiver, caster)]
     for of_receiver in torch.unique(levels[0]).tolist():
+        a = receiver.choose((levels[0] == of_receiver).nonzero().flatten())
         for of_caster in torch.unique(levels[1]).tolist():
-            a = receiver.choose((levels[0] == of_receiver).nonzero().flatten())
             b = caster.choose((levels[1] == of_caster).nonzero().flatten())
-            for i, j in _meeting_in_cells(a, b, 2 ** min(of_receiver, of_caster)):
-                near = (a.low[:, i] <= b.high[:, j]).all(0) & (b.low[:, j] <= a.high[:, i]).all(0)
-                near &= b.depth[j] <= a.depth[i]
-                r, c = a.which[i[near]], b.which[j[near]]
-                together = _share_time(receivers, casters, r, c) & (receivers.face[r] != casters.face[c])
-                if together.any():
-                    yield r[together], c[together]
+            yield a, b, _meeting_in_cells(a, b, 2 ** min(of_receiver, of_caster))
 
 
 def _share_time(receivers: Receivers, casters: Casters, r: Tensor, c: Tensor) -> Tensor:

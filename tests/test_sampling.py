@@ -20,8 +20,8 @@ def agreement(name):
     return make.to_torch(agreement_scenes.SCENES[name]())
 
 
-def lit(name):
-    return lit_scenes.to_torch(lit_scenes.SCENES[name]())
+def lit(name, casts_shadows=False):
+    return lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=casts_shadows)
 
 
 def halton(scene, n, **options):
@@ -130,9 +130,10 @@ def test_at_one_moment_they_are_the_sharp_image(name, t):
         assert int(differs.sum()) <= 1  # an edge may lie on a ray just then
 
 
+@pytest.mark.parametrize("casts_shadows", [False, True])
 @pytest.mark.parametrize("name", list(lit_scenes.SCENES))
-def test_texture_and_light_are_those_of_the_sharp_image(name):
-    scene = lit(name)
+def test_texture_and_light_are_those_of_the_sharp_image(name, casts_shadows):
+    scene = lit(name, casts_shadows)
     for t in (0.2, 0.8):
         sharp = tb.render_instant(scene, t).rgba
         assert float(sharp[..., :3].std()) > 0

@@ -25,14 +25,15 @@ ROTOR_RADIUS = 1.5
 Flat = tuple[Tensor, Tensor, Tensor]  # vertices (V, 2), faces (F, 3), colours (F, 3)
 
 
-def rotor(size: int = 256) -> tb.Scene:
-    """Return a disc of light and dark sectors that turns by two pairs of them: in truth all circles become even."""
+def rotor(size: int = 256, turn_deg: float = 2 * 360 / SECTORS) -> tb.Scene:
+    """Return a disc of light and dark sectors that turns, by two pairs of them if not told otherwise: in truth all
+    circles then become even.
+    """
     light, dark = torch.tensor([0.95, 0.75, 0.2]), torch.tensor([0.1, 0.15, 0.35])
     colours = [light if k % 2 else dark for k in range(2 * SECTORS)]
     rings = [(0.12, ROTOR_RADIUS)]
     disc = _join([_ring(rings[0], colours, 12), _ring((0.0, 0.12), [torch.tensor([0.7, 0.1, 0.1])], 24)])
-    turn = 2 * 360 / SECTORS
-    return tb.Scene([_turning(disc, (0, 0, 0), turn, "rotor")], _camera(size), BACKDROP)
+    return tb.Scene([_turning(disc, (0, 0, 0), turn_deg, "rotor")], _camera(size), BACKDROP)
 
 
 def gears(size: int = 256) -> tb.Scene:

@@ -157,16 +157,13 @@ def _see(scene: Scene, surfaces: Surfaces, rays: _Rays) -> Tensor:
     which = needing_points(surfaces, face)
     own = prism[which]
     mips = which if slope.shape[1] else which[:0]
-    moving = ((1 - u[which]) * c[0][..., own] + u[which] * c[1][..., own] if c.shape[-1] else c[0]
-              for c in (prisms.world, prisms.normal))  # fmt: skip
-    world, normal = moving
     points = Points(
         face=face[which],
         weight=weight[:, which],
         slope=slope[..., mips],
         uv=prisms.corner_uv(own),
-        world=world,
-        normal=normal,
+        world=_between(prisms.world, own, u[which]),
+        normal=_between(prisms.normal, own, u[which]),
         turn=prisms.parity[own],
         side=side[which],
         t=rays.t[pixel[which]],
@@ -176,6 +173,13 @@ def _see(scene: Scene, surfaces: Surfaces, rays: _Rays) -> Tensor:
     before, after = packed.transmittance(seen.alpha, offsets)
     light = packed.sum_by_owner((before * seen.alpha).unsqueeze(1) * seen.rgb, offsets)
     return torch.cat([light, (1 - after).unsqueeze(1)], dim=1)
+
+
+def _between(ends: Tensor, prism: Tensor, u: Tensor) -> Tensor:
+    """Return (3, 3, J) the values at corners of `prism` (J,) at times `u` inside them; (3, 3, 0) of no values."""
+    if ends.shape[-1] == 0:
+        return ends[0]
+    return (1 - u) * ends[0][..., prism] + u * ends[1][..., prism]
 
 
 def _pairs(prisms: Prisms, rays: _Rays, width: int) -> Iterator[tuple[Tensor, Tensor]]:

@@ -133,7 +133,7 @@ def plant_facing_by_stored_order(patch):
 
 def plant_background_not_weighted(patch):
     def wrong(result):
-        return dataclasses.replace(result, alpha=torch.ones_like(result.alpha))
+        return dataclasses.replace(result, rgba=torch.cat([result.rgba[:, :3], torch.ones_like(result.rgba[:, 3:])], 1))
 
     patch.setattr(render, "expose_samples", changed(render.expose_samples, wrong))
 

@@ -41,13 +41,13 @@ render = importlib.import_module("torchblur.render")  # the module, which the fu
 def lambert(normal_scale=lambda n: n.norm(dim=0), clamp=lambda c: c.clamp(min=0), ambient=1.0):
     """Return Lambert's law, or a wrong one."""
 
-    def reflected(surfaces, point, normal, t):
+    def reflected(surfaces, point, normal, t, _visible):
         total = ambient * surfaces.ambient.expand(point.shape[1], 3)
         for light in surfaces.lights:
             to_light, irradiance = light.arriving(point, t)
             cosine = clamp((normal / normal_scale(normal) * to_light).sum(0))
             total = total + irradiance * (cosine / math.pi).unsqueeze(1)
-        return total
+        return total, torch.zeros_like(total[:, :2])
 
     return reflected
 

@@ -147,6 +147,7 @@ def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, r
         _transparency(prisms, survey),
         _texture(prisms, textures),
         _lighting(prisms),
+        _shadows(prisms),
         _clipping(prisms),
         _facing(prisms, survey, int(away.sum())),
         _crossings(prisms, survey),
@@ -214,6 +215,17 @@ def _lighting(prisms: Prisms) -> Effect:
     changing = int((is_lit & surfaces.is_varying[prisms.face_of]).sum())
     cost = f"{changing:,} prisms followed by each light" if changing and kinds else "one look a slice of time"
     return Effect("lighting", True, f"{n:,} prisms: {names}", cost)
+
+
+def _shadows(prisms: Prisms) -> Effect:
+    surfaces, casters = prisms.surfaces, prisms.surfaces.casters
+    n = int(surfaces.is_lit[prisms.face_of].sum())
+    n_lights = sum(light.casts_shadows for light in surfaces.lights)
+    if casters is None or n == 0:
+        return Effect("shadows", False, "no light casts any on what is in view", "none")
+    why = f"{len(torch.unique(casters.face)):,} faces, in view or not, cast them on {n:,} prisms from {n_lights} lights"
+    changes = "when each caster blocks each point that is seen, for each light"
+    return Effect("shadows", True, why, changes if casters.moves else changes + "; only lights or what receives move")
 
 
 def _clipping(prisms: Prisms) -> Effect:

@@ -1,6 +1,6 @@
 """What accuracy costs in time: this package, brute force and filters of the sharp image, on the same scenes in one run.
 
-    python scripts/accuracy_vs_time.py --out folder [--quick] [--size 192]
+    python scripts/accuracy_vs_time.py --out folder [--quick] [--size 128]
 
 Writes results.json, a plot of error against time for each scene and one of all, a sheet of images, and index.html,
 which holds all of them and opens offline. A scene is measured as a whole, its methods taking turns, and stored when it
@@ -144,11 +144,11 @@ def main(argv: list[str] | None = None) -> None:
     """Measure what is not there yet and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, required=True, help="folder, created if need be")
-    parser.add_argument("--size", type=int, help="height of the images [px]; 192, or 96 with --quick")
+    parser.add_argument("--size", type=int, help="height of the images [px]; 128, or 96 with --quick")
     parser.add_argument("--repeats", type=int, default=1, help="turns that are timed")
     parser.add_argument("--quick", action="store_true", help="fewer scenes and counts, smaller images")
     arguments = parser.parse_args(argv)
-    size = arguments.size or (96 if arguments.quick else 192)
+    size = arguments.size or (96 if arguments.quick else 128)
     counts, names = (QUICK_COUNTS, QUICK_SCENES) if arguments.quick else (COUNTS, tuple(SCENES))
     settings = {"size_px": size, "counts": list(counts), "repeats": arguments.repeats, "torch": torch.__version__}
     settings["check_times"] = QUICK_CHECK_TIMES if arguments.quick else CHECK_TIMES

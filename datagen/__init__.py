@@ -1,8 +1,8 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
-sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, manifest, executors, progress, dataset,
-report, runs, __main__.
+sequences, shapes, patterns, stages, casts, scenes, baselines/, samples, pictures, writer, manifest, executors,
+progress, dataset, report, runs, __main__.
 """
 
 from __future__ import annotations

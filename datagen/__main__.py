@@ -53,6 +53,9 @@ class Arguments:
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
     """Frames per second at which a sequence is played."""
+    baselines: str = ""
+    """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
+    between commas."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
 

@@ -1,4 +1,4 @@
-"""Colour spaces: linear light to and from the sRGB curve (the only door to kornia).
+"""Colour spaces: linear light to and from the sRGB curve (a door to kornia).
 
 Before: nothing.  After: patterns.py, assets.py (sRGB in), writer.py and report.py (sRGB out).
 """

@@ -39,8 +39,9 @@ class BlurDataset(Dataset[dict[str, Any]]):
     An item is a dict of tensors: `sharp`, `blurred` (3, H, W) linear RGB; `motion` (2, H, W) [px, x right, y down]
     over the exposure, `motion_next` and `motion_previous` to the neighbour frames' sharp instants (NaN where the
     point is behind the camera then); `depth` (1, H, W) [scene units], inf where nothing is; `alpha` over the exposure
-    and `sharp_alpha` (1, H, W); `mesh_id` and `face_id` (1, H, W) int64, -1 where nothing is; `index`; and `meta`, the
-    frame's metadata as JSON text, which the default collate of a DataLoader keeps as a list of str.
+    and `sharp_alpha` (1, H, W); `mesh_id` and `face_id` (1, H, W) int64, -1 where nothing is; `baseline_NAME`
+    (3, H, W) linear RGB for each filter that the data set was made with; `index`; and `meta`, the frame's metadata as
+    JSON text, which the default collate of a DataLoader keeps as a list of str.
 
     Files are opened when an item is asked for; the object is small and can travel to worker processes.
 
@@ -58,16 +59,18 @@ class BlurDataset(Dataset[dict[str, Any]]):
     """
 
     def __init__(self, folder: str | Path, keys: Sequence[str] | None = None) -> None:
-        known = (*PLANES, *IDS)
-        unknown = [k for k in keys or () if k not in known]
-        if unknown:
-            raise ValueError(f"keys: expected some of {', '.join(known)}, got {', '.join(unknown)}")
         self.folder = Path(folder)
-        self.keys = tuple(known if keys is None else keys)
         try:
             entries = read_manifest(folder)
         except FileNotFoundError:
             raise FileNotFoundError(f"folder: expected a data set with a manifest.jsonl, got {str(folder)!r}") from None
+        names = sorted(set.intersection(*(set(e.get("baselines", ())) for e in entries.values()))) if entries else []
+        self.planes = PLANES | {f"baseline_{name}": (f"baseline.{name}", ("R", "G", "B")) for name in names}
+        known = (*self.planes, *IDS)
+        unknown = [k for k in keys or () if k not in known]
+        if unknown:
+            raise ValueError(f"keys: expected some of {', '.join(known)}, got {', '.join(unknown)}")
+        self.keys = tuple(known if keys is None else keys)
         self.indices = tuple(entries)
         sums = [file["sha256"] for e in entries.values() for file in e["files"] if file["path"].endswith(".exr")]
         self._sums = np.array(sums, dtype="S64")  # one array, as millions of texts would be slow to send to workers
@@ -93,7 +96,7 @@ class BlurDataset(Dataset[dict[str, Any]]):
                 if key in IDS:
                     result[key] = torch.from_numpy(parts["data"][IDS[key]].astype(np.int64)).unsqueeze(0) - 1
                 else:
-                    result[key] = _stack(parts, *PLANES[key])
+                    result[key] = _stack(parts, *self.planes[key])
         except KeyError as error:
             raise FrameFileError(f"{path}: expected a channel {error}, got a frame without it") from None
         return result

@@ -22,7 +22,7 @@ from typing import Any
 import torchblur as tb
 from datagen.scenes import Plan
 from datagen.spec import NOT_IN_THE_BYTES, SpecError
-from datagen.writer import FOLDERS, TEMPORARY_PREFIX, frame_paths, sync_folder, write_atomically
+from datagen.writer import FOLDERS, TEMPORARY_PREFIX, baselines_entry, frame_paths, sync_folder, write_atomically
 
 try:
     import fcntl
@@ -253,8 +253,9 @@ def _is_entry(entry: Any) -> bool:
     index, files = entry["index"], entry["files"]
     if type(index) is not int or index < 0 or not isinstance(entry["config_sha256"], str):
         return False
-    if not isinstance(entry["effects"], list) or not all(isinstance(name, str) for name in entry["effects"]):
-        return False
+    for names in (entry["effects"], entry.get("baselines", [])):
+        if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+            return False
     sums_fit = all(re.fullmatch("[0-9a-f]{64}", file["sha256"]) for file in files)
     return sums_fit and sorted(file["path"] for file in files) == sorted(frame_paths(index).values())
 
@@ -263,6 +264,7 @@ def _damage(folder: Path, entry: dict[str, Any], plan: Plan) -> str:
     """Return what is wrong with a listed frame, or an empty string if every byte of it is as listed."""
     clip, frame = plan.spec.clip_and_frame(entry["index"])
     expected = {"index": entry["index"], "clip": clip, "frame": frame, "config_sha256": plan.config_sha256}
+    expected |= baselines_entry(plan.spec.baseline_names)
     if {name: value for name, value in entry.items() if name not in ("effects", "files")} != expected:
         return f"its line in {MANIFEST_NAME} is not of this configuration"
     return ", ".join(filter(None, (_file_damage(folder, file) for file in entry["files"])))

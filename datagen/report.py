@@ -1,7 +1,7 @@
 """Report: a contact sheet of a data set, to be looked at, and what its frames called for.
 
 Before: dataset.py, colour.py, pictures.py.  After: runs.py.
-Symbols: H, W size of a cell. One row a frame: sharp, blurred, motion, depth, alpha.
+Symbols: H, W size of a cell. One row a frame: sharp, blurred, what filters make of it if any, motion, depth, alpha.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from datagen.pictures import encode_png, shrink, write_labels
 from datagen.writer import write_atomically
 
 SHEET_NAME = "contact_sheet.png"
+BASELINE = "baseline_"
 COLUMNS = ("sharp", "blurred", "motion", "depth", "alpha")
 MAX_ROWS = 12
 MAX_CELL_PX = 256
@@ -38,7 +39,9 @@ def write_contact_sheet(folder: str | Path) -> Path:
 
     Source: ours.
     """
-    dataset = BlurDataset(folder, keys=COLUMNS)
+    baselines = [key for key in BlurDataset(folder, keys=()).planes if key.startswith(BASELINE)]
+    columns = (*COLUMNS[:2], *baselines, *COLUMNS[2:])
+    dataset = BlurDataset(folder, keys=columns)
     n_rows = min(MAX_ROWS, len(dataset))
     chosen = sorted({round(k * (len(dataset) - 1) / max(n_rows - 1, 1)) for k in range(n_rows)})
     rows, labels, top = [], [], TITLE_PX
@@ -48,15 +51,17 @@ def write_contact_sheet(folder: str | Path) -> Path:
         height, width = pictures["sharp"].shape[:2]
         scale = min(1.0, MAX_CELL_PX / max(width, height))
         size = (max(1, round(width * scale)), max(1, round(height * scale)))
-        cells = [pictures[c] if scale == 1 else shrink(pictures[c], *size) for c in COLUMNS]
+        cells = [pictures[c] if scale == 1 else shrink(pictures[c], *size) for c in columns]
         rows.append(_beside(cells))
         meta = json.loads(frame["meta"])
         fastest = float(frame["motion"].nan_to_num().norm(dim=0).max())
         kinds = " ".join(str(v) for k, v in sorted(meta["scene"].items()) if isinstance(v, str))
-        texts = (f"{frame['index']}", kinds, f"up to {fastest:.1f} px", "near is bright", "white is opaque")
-        labels += [(GAP_PX + k * (size[0] + GAP_PX), top + size[1] + 2, text) for k, text in enumerate(texts)]
+        texts = {"sharp": f"{frame['index']}", "blurred": kinds, "motion": f"up to {fastest:.1f} px"}
+        texts |= {"depth": "near is bright", "alpha": "white is opaque"}
+        places = {name: GAP_PX + k * (size[0] + GAP_PX) for k, name in enumerate(columns)}
+        labels += [(places[name], top + size[1] + 2, text) for name, text in texts.items()]
         top += size[1] + TITLE_PX
-    labels += [(GAP_PX + k * (size[0] + GAP_PX), 3, name) for k, name in enumerate(COLUMNS)]
+    labels += [(x, 3, name.removeprefix(BASELINE)) for name, x in places.items()]
     sheet = np.full((top + 2, rows[0].shape[1], 3), PAPER, np.uint8)
     y = TITLE_PX
     for row in rows:
@@ -92,9 +97,8 @@ def frame_pictures(frame: dict[str, Tensor]) -> dict[str, np.ndarray]:
         inverse = torch.where(seen, 1 / depth.clamp(min=1e-6), torch.zeros_like(depth))
         low, high = inverse[seen].min(), inverse[seen].max()
         shade = torch.where(seen, 0.12 + 0.88 * (inverse - low) / (high - low).clamp(min=1e-9), shade)
-    return {
-        "sharp": bytes_from_linear(frame["sharp"].permute(1, 2, 0)).numpy(),
-        "blurred": bytes_from_linear(frame["blurred"].permute(1, 2, 0)).numpy(),
+    images = [key for key in frame if key in ("sharp", "blurred") or key.startswith(BASELINE)]
+    return {key: bytes_from_linear(frame[key].permute(1, 2, 0)).numpy() for key in images} | {
         "motion": motion_colours(frame["motion"].permute(1, 2, 0)),
         "depth": _grey(shade),
         "alpha": _grey(frame["alpha"][0].clamp(0, 1)),

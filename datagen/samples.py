@@ -1,6 +1,6 @@
 """Samples: a clip's frame rendered into everything that is stored of it.
 
-Before: scenes.py.  After: writer.py.
+Before: scenes.py, baselines.  After: writer.py.
 Symbols: H, W image size; M meshes. Motions in pixels, x right, y down: p(later) = p(now) + motion.
 The sharp image is the instant in the middle of the exposure; depth, motions and ids belong to it.
 """
@@ -8,12 +8,13 @@ The sharp image is the instant in the middle of the exposure; depth, motions and
 from __future__ import annotations
 
 import functools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torch import Tensor
 
 import torchblur as tb
+from datagen.baselines.filters import filter_instant
 from datagen.clips import Clip, Exposure, expose, freeze
 from datagen.knots import MAX_SEGMENTS, TOLERANCE_PX
 from datagen.scenes import Plan, build_clip, plan_from_json
@@ -29,6 +30,7 @@ UNITS = {
     "sharp.A": "mean opacity of the meshes at the sharp instant",
     "id": "mesh and face number plus 1 of the pixel centre at the sharp instant; 0: nothing there",
     "coverage": "share of the exposure in which a mesh is visible at the pixel, by mesh number",
+    "baseline": "linear RGB of a filter of the sharp image, with the settings that `baselines` lists",
     "time": "seconds from the start of the clip",
     "camera": "world to clip, OpenGL convention, column vectors, at equal steps from opening to closing",
 }
@@ -48,6 +50,7 @@ class Sample:
     face_id: Tensor  # (H, W) int64, -1 where nothing is
     coverage: Tensor  # (H, W, M) share of the exposure
     meta: dict[str, Any]  # JSON values
+    baselines: dict[str, Tensor] = field(default_factory=dict)  # by filter: (H, W, 3) linear RGB
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,7 @@ def render_sample(clip: Clip, plan: Plan, index: int, frame: int) -> Sample:
     exposure = expose(clip, *size, times.open_s, times.close_s)
     blurred = tb.render(exposure.scene, rays_per_pixel=spec.rays_per_pixel)
     now = tb.render_instant(exposure.scene, t=0.5, rays_per_pixel=spec.rays_per_pixel)
+    baselines, settings = filter_instant(exposure.scene, now, spec.baseline_names)
     return Sample(
         sharp=now.rgba,
         blurred=blurred.rgba,
@@ -115,7 +119,8 @@ def render_sample(clip: Clip, plan: Plan, index: int, frame: int) -> Sample:
         face_id=now.face_id,
         coverage=blurred.coverage,
         meta=_metadata(clip, exposure, plan, index, times)
-        | {"counts": dict(sorted(blurred.counts.items())), "plan": blurred.plan.to_dict()},
+        | {"counts": dict(sorted(blurred.counts.items())), "plan": blurred.plan.to_dict(), "baselines": settings},
+        baselines=baselines,
     )
 
 

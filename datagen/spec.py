@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -21,6 +21,7 @@ else:
     import tomli as tomllib
 
 SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+BASELINES = ("directional", "mcguire2012", "guertin2014", "guertin2015")  # in baselines/filters.py, which needs torch
 NOT_IN_THE_BYTES = ("count", "assets")  # a longer run extends a shorter one; a folder's place is not its content
 
 
@@ -46,6 +47,7 @@ class DatasetSpec(BaseModel):
         exposure: share of the frame time 1/fps during which the shutter is open, in (0, 1].
         rays_per_pixel: rays inside each pixel, 1 = its centre.
         sequence_fps: at what rate a sequence is played [Hz].
+        baselines: filters whose images are stored beside the exact one: names from BASELINES, between commas.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -62,6 +64,18 @@ class DatasetSpec(BaseModel):
     rays_per_pixel: int = Field(default=4, ge=1, le=4096)
     sequence_fps: float = Field(default=24.0, gt=0, le=1e6, allow_inf_nan=False)
 
+    baselines: str = ""
+
+    @field_validator("baselines")
+    @classmethod
+    def _baselines_exist(cls, text: str) -> str:
+        names = text.split(",") if text else []
+        if len(set(names)) < len(names) or not set(names) <= set(BASELINES):
+            raise ValueError(
+                f"baselines: expected different ones of {', '.join(BASELINES)}, between commas, got {text!r}"
+            )
+        return text
+
     @model_validator(mode="after")
     def _assets_fit_the_source(self) -> DatasetSpec:
         problem = assets_problem(self.source, self.assets)
@@ -73,6 +87,11 @@ class DatasetSpec(BaseModel):
     def exposure_s(self) -> float:
         """How long the shutter is open [s]."""
         return self.exposure / self.fps
+
+    @property
+    def baseline_names(self) -> tuple[str, ...]:
+        """The filters whose images are stored, in the order of BASELINES."""
+        return tuple(name for name in BASELINES if name in self.baselines.split(","))
 
     def clip_and_frame(self, index: int) -> tuple[int, int]:
         """Return (clip, frame within the clip) of frame `index` of the data set."""

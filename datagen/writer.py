@@ -2,7 +2,8 @@
 
 Before: samples.py.  After: manifest.py lists what is finished; dataset.py reads with `read_exr`.
 Symbols: H, W image size. Parts of the EXR, ZIP-compressed, which carries a checksum:
-`sharp` R G B A and `blurred` R G B in half; `data` in float32 (ids in uint32); `coverage` one float32 channel a mesh.
+`sharp` R G B A and `blurred` R G B in half; `data` in float32 (ids in uint32); `coverage` one float32 channel a mesh;
+`baseline.NAME` R G B in half for each filter that was asked for.
 """
 
 from __future__ import annotations
@@ -76,7 +77,12 @@ def write_frame(folder: str | Path, index: int, sample: Sample) -> dict[str, Any
         "config_sha256": meta["config_sha256"],
         "effects": [name for name, effect in meta["plan"]["effects"].items() if effect["needed"]],
         "files": files,
-    }
+    } | baselines_entry(tuple(sample.baselines))
+
+
+def baselines_entry(names: tuple[str, ...]) -> dict[str, list[str]]:
+    """Return what the manifest's entry of a frame says of its baselines: nothing if there are none. Source: ours."""
+    return {"baselines": list(names)} if names else {}
 
 
 def sample_parts(sample: Sample) -> dict[str, dict[str, np.ndarray]]:
@@ -98,6 +104,9 @@ def sample_parts(sample: Sample) -> dict[str, dict[str, np.ndarray]]:
     }
     if sample.coverage.shape[-1]:  # a part without channels cannot be stored
         parts["coverage"] = {f"mesh.{m:04d}": _float(sample.coverage[..., m]) for m in range(sample.coverage.shape[-1])}
+    for name, image in sample.baselines.items():
+        part = f"baseline.{name}"
+        parts[part] = {c: _half(part, image[..., k]) for k, c in enumerate("RGB")}
     return parts
 
 

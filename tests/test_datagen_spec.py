@@ -26,6 +26,10 @@ from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields
         ("exposure", 1.5),
         ("rays_per_pixel", 0),
         ("sequence_fps", float("inf")),
+        ("baselines", "mcguire2012,blur2030"),
+        ("baselines", "mcguire2012,mcguire2012"),
+        ("baselines", "mcguire2012, guertin2015"),
+        ("baselines", ["mcguire2012"]),
         ("workers", 2),  # how it is made is no part of what is made
         ("assets", "somewhere"),  # the built-in shapes have none
     ],
@@ -76,7 +80,7 @@ def test_the_hash_leaves_out_count_and_the_place_of_assets_only(tmp_path):
     base = parse_spec({})
     assert parse_spec({"count": 99}).config_sha256() == base.config_sha256()
     changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
-               "rays_per_pixel": 1, "sequence_fps": 12.0}  # fmt: skip
+               "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015"}  # fmt: skip
     hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}
     assert len(hashes) == len(changed) + 1
     assert set(changed) == set(DatasetSpec.model_fields) - {"count", "assets", "source"}

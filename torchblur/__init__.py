@@ -8,7 +8,7 @@ from torchblur.lights import DirectionalLight, PointLight, SpotLight
 from torchblur.material import Material
 from torchblur.metrics import flip_hdr, flip_ldr, psnr, ssim
 from torchblur.render import Frame, render, render_windows
-from torchblur.sampling import Accumulated, accumulate
+from torchblur.sampling import Accumulated, accumulate, stochastic
 from torchblur.scene import Mesh, Scene
 from torchblur.shutter import Shutter
 
@@ -38,4 +38,5 @@ __all__ = [
     "render_instant",
     "render_windows",
     "ssim",
+    "stochastic",
 ]

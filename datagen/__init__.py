@@ -2,7 +2,7 @@
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
 sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, manifest, executors, progress, dataset,
-report, runs, __main__.
+report, runs, flow_files, layouts, picture_store, export, __main__.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from datagen.dataset import BlurDataset
+    from datagen.export import ExportError, ExportResult, export_dataset
+    from datagen.flow_files import FlowFileError, encode_flow, read_flow
     from datagen.formats import MeshError
     from datagen.manifest import ManifestError, verify_dataset
     from datagen.runs import RunResult, generate
@@ -22,25 +24,37 @@ if TYPE_CHECKING:
 _HOMES = {
     "BlurDataset": "dataset",
     "DatasetSpec": "spec",
+    "ExportError": "export",
+    "ExportResult": "export",
+    "FlowFileError": "flow_files",
     "FrameFileError": "writer",
     "ManifestError": "manifest",
     "MeshError": "formats",
     "RunResult": "runs",
     "SpecError": "spec",
+    "encode_flow": "flow_files",
+    "export_dataset": "export",
     "generate": "runs",
     "parse_spec": "spec",
+    "read_flow": "flow_files",
     "verify_dataset": "manifest",
 }
 __all__ = [
     "BlurDataset",
     "DatasetSpec",
+    "ExportError",
+    "ExportResult",
+    "FlowFileError",
     "FrameFileError",
     "ManifestError",
     "MeshError",
     "RunResult",
     "SpecError",
+    "encode_flow",
+    "export_dataset",
     "generate",
     "parse_spec",
+    "read_flow",
     "verify_dataset",
 ]
 

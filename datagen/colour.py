@@ -1,6 +1,7 @@
-"""Colour spaces: linear light to and from the sRGB curve (the only door to kornia).
+"""Colour spaces: linear light to and from the sRGB curve, and to a power curve (the only door to kornia).
 
-Before: nothing.  After: patterns.py, assets.py (sRGB in), writer.py and report.py (sRGB out).
+Before: nothing.  After: patterns.py, assets.py (sRGB in), writer.py and report.py (sRGB out),
+export.py (power out).
 """
 
 from __future__ import annotations
@@ -27,3 +28,12 @@ def linear_from_srgb(rgb: Tensor) -> Tensor:
 def bytes_from_linear(rgb: Tensor) -> Tensor:
     """Return (H, W, 3) uint8 sRGB of linear (H, W, 3) colours, rounded to nearest. Source: ours."""
     return (srgb_from_linear(rgb.to(torch.float64)) * 255).round().to(torch.uint8)
+
+
+def gamma_bytes_from_linear(rgb: Tensor) -> Tensor:
+    """Return (H, W, 3) uint8 of linear (H, W, 3) colours clipped to [0, 1], to the power 1/2.2, rounded to nearest.
+
+    Source: the camera response of GoPro's `blur_gamma`, Nah et al. 2017.
+    """
+    coded = rgb.to(torch.float64).clamp(0, 1) ** (1 / 2.2)
+    return (coded * 255).round().to(torch.uint8)

@@ -21,7 +21,14 @@ from typing import Any
 import torchblur as tb
 from datagen.scenes import Plan
 from datagen.spec import NOT_IN_THE_BYTES, SpecError
-from datagen.writer import FOLDERS, TEMPORARY_PREFIX, frame_paths, sync_folder, write_atomically
+from datagen.writer import (
+    FOLDERS,
+    TEMPORARY_PREFIX,
+    FrameFileError,
+    frame_paths,
+    sync_folder,
+    write_atomically,
+)
 
 try:
     import fcntl
@@ -139,6 +146,37 @@ def read_manifest(folder: str | Path) -> dict[int, dict[str, Any]]:
         if entries.setdefault(entry["index"], entry) != entry:
             raise ManifestError(f"{folder}: expected one entry of frame {entry['index']}, got two that differ")
     return dict(sorted(entries.items()))
+
+
+def read_run(folder: str | Path) -> dict[str, Any]:
+    """Return what `run.json` of a data set holds.
+
+    Raises:
+        SpecError: it is missing or damaged.
+
+    Source: ours.
+    """
+    return _read_run(Path(folder) / RUN_NAME)
+
+
+def read_listed_file(folder: str | Path, entry: dict[str, Any], path: str) -> bytes:
+    """Return the bytes of one of a frame's files.
+
+    Args:
+        folder: of the data set.
+        entry: of the frame, from the manifest.
+        path: as the entry has it.
+
+    Raises:
+        FrameFileError: the file is missing or its bytes are not those that the manifest lists.
+
+    Source: ours.
+    """
+    file = next(f for f in entry["files"] if f["path"] == path)
+    data, problem = _read_file(Path(folder), file)
+    if problem:
+        raise FrameFileError(f"{folder}: expected the files that the manifest lists, but {problem}")
+    return data
 
 
 def append_entry(folder: Path, entry: dict[str, Any]) -> None:
@@ -267,11 +305,16 @@ def _damage(folder: Path, entry: dict[str, Any], plan: Plan) -> str:
 
 def _file_damage(folder: Path, file: dict[str, Any]) -> str:
     """Return what is wrong with a listed file, or an empty string."""
+    return _read_file(folder, file)[1]
+
+
+def _read_file(folder: Path, file: dict[str, Any]) -> tuple[bytes, str]:
+    """Return the bytes of a listed file, and what is wrong with them or an empty string."""
     try:
         data = (folder / file["path"]).read_bytes()
     except FileNotFoundError:
-        return f"{file['path']} is missing"
+        return b"", f"{file['path']} is missing"
     except OSError as error:
-        return f"{file['path']} cannot be read ({error.strerror})"
+        return b"", f"{file['path']} cannot be read ({error.strerror})"
     is_same = hashlib.sha256(data).hexdigest() == file["sha256"] and len(data) == file.get("bytes")
-    return "" if is_same else f"{file['path']} differs from the manifest"
+    return data, "" if is_same else f"{file['path']} differs from the manifest"

@@ -1,8 +1,8 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
-sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, manifest, executors, progress, dataset,
-report, runs, flow_files, layouts, picture_store, export, __main__.
+sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, folders, listed_files, manifest, shards,
+entries, executors, progress, dataset, report, runs, checks, flow_files, layouts, picture_store, export, __main__.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datagen.checks import Status, read_status, verify_dataset
     from datagen.dataset import BlurDataset
     from datagen.export import ExportError, ExportResult, export_dataset
     from datagen.flow_files import FlowFileError, encode_flow, read_flow
     from datagen.formats import MeshError
-    from datagen.manifest import ManifestError, verify_dataset
+    from datagen.manifest import ManifestError
     from datagen.runs import RunResult, generate
     from datagen.spec import DatasetSpec, SpecError, parse_spec
     from datagen.writer import FrameFileError
@@ -32,12 +33,14 @@ _HOMES = {
     "MeshError": "formats",
     "RunResult": "runs",
     "SpecError": "spec",
+    "Status": "checks",
     "encode_flow": "flow_files",
     "export_dataset": "export",
     "generate": "runs",
     "parse_spec": "spec",
     "read_flow": "flow_files",
-    "verify_dataset": "manifest",
+    "read_status": "checks",
+    "verify_dataset": "checks",
 }
 __all__ = [
     "BlurDataset",
@@ -50,11 +53,13 @@ __all__ = [
     "MeshError",
     "RunResult",
     "SpecError",
+    "Status",
     "encode_flow",
     "export_dataset",
     "generate",
     "parse_spec",
     "read_flow",
+    "read_status",
     "verify_dataset",
 ]
 

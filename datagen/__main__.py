@@ -17,7 +17,7 @@ import tyro
 from datagen.spec import SpecError, parse_spec, read_spec_fields
 
 EXIT_DONE, EXIT_FAILURES, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
-NOT_IN_THE_SPEC = ("out", "workers", "config")
+NOT_IN_THE_SPEC = ("out", "workers", "slice", "config")
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class Arguments:
     out: str
     """Folder of the data set; created if need be."""
     config: str | None = None
-    """TOML file with any of the options below but --workers; options given here win."""
+    """TOML file with any of the options below but --workers and --slice; options given here win."""
     count: int = 16
     """Number of frames."""
     width: int = 256
@@ -53,8 +53,14 @@ class Arguments:
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
     """Frames per second at which a sequence is played."""
+    storage: Literal["auto", "folder", "shards"] = "auto"
+    """A file for each thing, or tar files as WebDataset has them; auto: tar files from 1,000 frames on."""
+    frames_per_shard: int = 100
+    """Frames of a tar file."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
+    slice: str | None = None
+    """Make part i of n, as `3/100`; the other parts may run elsewhere at the same time. Needs --storage shards."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -84,12 +90,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(spec: Any, arguments: Arguments) -> int:
     """Generate and tell how it went."""
+    from datagen.folders import parse_slice
     from datagen.formats import MeshError
     from datagen.runs import generate
     from datagen.writer import FrameFileError
 
     try:
-        result = generate(spec, arguments.out, arguments.workers, is_quiet=False)
+        part = None if arguments.slice is None else parse_slice(arguments.slice)
+        result = generate(spec, arguments.out, arguments.workers, is_quiet=False, part=part)
     except (SpecError, MeshError) as error:
         return _usage(str(error).splitlines())
     except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again

@@ -16,9 +16,11 @@ import numpy as np
 
 from datagen.colour import gamma_bytes_from_linear
 from datagen.dataset import BlurDataset
+from datagen.entries import read_entries
 from datagen.flow_files import FLOW_SUFFIXES, FlowFileError, encode_flow
+from datagen.folders import read_run
 from datagen.layouts import CODED, FLOWS, LAYOUTS, PICTURES, Layout, place_of
-from datagen.manifest import read_listed_file, read_manifest, read_run
+from datagen.listed_files import read_listed_file
 from datagen.picture_store import PAGE_BYTES, need_lmdb, write_store
 from datagen.pictures import encode_png
 from datagen.writer import frame_paths, write_atomically
@@ -75,7 +77,7 @@ def export_dataset(
     """
     folder, out = Path(folder), Path(out)
     run = read_run(folder)
-    entries = read_manifest(folder)
+    entries = read_entries(folder)
     problems = _request_problems(layout, split, flow_suffix) or _data_problems(run, entries, LAYOUTS[layout])
     if problems:
         raise ExportError(problems)

@@ -21,7 +21,8 @@ else:
     import tomli as tomllib
 
 SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
-NOT_IN_THE_BYTES = ("count", "assets")  # a longer run extends a shorter one; a folder's place is not its content
+# A longer run extends a shorter one; a folder's place is not its content; storage does not change a frame's files.
+NOT_IN_THE_BYTES = ("count", "assets", "storage", "frames_per_shard")
 
 
 class SpecError(ValueError):
@@ -46,6 +47,9 @@ class DatasetSpec(BaseModel):
         exposure: share of the frame time 1/fps during which the shutter is open, in (0, 1].
         rays_per_pixel: rays inside each pixel, 1 = its centre.
         sequence_fps: at what rate a sequence is played [Hz].
+        storage: `folder` (a file for each thing), `shards` (tar files of many frames, as WebDataset has them) or
+            `auto`: a folder below 1,000 frames.
+        frames_per_shard: frames of a tar file.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -61,6 +65,8 @@ class DatasetSpec(BaseModel):
     exposure: float = Field(default=0.5, gt=0, le=1, allow_inf_nan=False)
     rays_per_pixel: int = Field(default=4, ge=1, le=4096)
     sequence_fps: float = Field(default=24.0, gt=0, le=1e6, allow_inf_nan=False)
+    storage: Literal["auto", "folder", "shards"] = "auto"
+    frames_per_shard: int = Field(default=100, ge=1, le=10**5)
 
     @model_validator(mode="after")
     def _assets_fit_the_source(self) -> DatasetSpec:

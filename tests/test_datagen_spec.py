@@ -72,14 +72,15 @@ def test_a_specification_cannot_be_changed():
         spec.width = 3
 
 
-def test_the_hash_leaves_out_count_and_the_place_of_assets_only(tmp_path):
+def test_the_hash_leaves_out_count_storage_and_the_place_of_assets_only(tmp_path):
     base = parse_spec({})
-    assert parse_spec({"count": 99}).config_sha256() == base.config_sha256()
     changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
                "rays_per_pixel": 1, "sequence_fps": 12.0}  # fmt: skip
     hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}
     assert len(hashes) == len(changed) + 1
-    assert set(changed) == set(DatasetSpec.model_fields) - {"count", "assets", "source"}
+    assert set(changed) == set(DatasetSpec.model_fields) - {"source", "count", "assets", "storage", "frames_per_shard"}
+    for field in ({"count": 99}, {"storage": "shards"}, {"frames_per_shard": 7}):
+        assert parse_spec(field).config_sha256() == base.config_sha256()
     assert base.config_sha256("a") != base.config_sha256("b")
 
 

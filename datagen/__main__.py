@@ -1,8 +1,7 @@
-"""Command line: `python -m datagen --out DIR --count N …` (the only door to tyro).
+"""Command line: `python -m datagen [generate] --out DIR …` and the commands of commands.py (the only door to tyro).
 
-Before: spec.py, runs.py.  After: nothing.
-Exit codes: 0 all done; 1 frames failed or assets were refused, which are listed; 2 wrong usage or configuration;
-130 interrupted. Starting the same command again finishes what is missing.
+Before: spec.py, commands.py.  After: nothing.
+Starting the same command again finishes what is missing. The exit codes are in commands.py.
 """
 
 from __future__ import annotations
@@ -14,9 +13,10 @@ from typing import Any, Literal
 
 import tyro
 
+from datagen.commands import COMMANDS, EXIT_DONE, EXIT_USAGE, make_dataset, run_command, tell_usage
 from datagen.spec import SpecError, parse_spec, read_spec_fields
 
-EXIT_DONE, EXIT_FAILURES, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
+PROGRAM = "python -m datagen"
 NOT_IN_THE_SPEC = ("out", "workers", "slice", "config")
 
 
@@ -25,6 +25,7 @@ class Arguments:
     """Generate sharp and exactly motion-blurred images with motion, depth, masks and ids.
 
     Stopped or killed, the same command finishes the rest; the bytes depend neither on that nor on the workers.
+    Other commands: init, status, verify, retry, export, inspect; each has its own --help.
     """
 
     out: str
@@ -72,48 +73,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     Source: ours.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    name = words[0] if words and not words[0].startswith("-") else "generate"
+    if name in COMMANDS:
+        try:
+            configured = tyro.conf.configure(tyro.conf.PositionalRequiredArgs, tyro.conf.FlagConversionOff)
+            command = tyro.cli(configured(COMMANDS[name]), prog=f"{PROGRAM} {name}", args=words[1:])
+        except SystemExit as stop:  # tyro has printed the help or what is wrong
+            return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
+        return run_command(command)
+    if name != "generate":
+        return tell_usage([f"command: expected one of generate, {', '.join(COMMANDS)}, got {name!r}"])
+    words = words[words[:1] == ["generate"] :]
     try:
         arguments = tyro.cli(
             tyro.conf.configure(tyro.conf.FlagConversionOff)(Arguments),
-            prog="python -m datagen",
+            prog=PROGRAM,
             args=words,
             default=_defaults(words),
         )
         chosen = {f.name: getattr(arguments, f.name) for f in fields(arguments) if f.name not in NOT_IN_THE_SPEC}
         spec = parse_spec(chosen)
     except SpecError as error:
-        return _usage(error.problems)
-    except SystemExit as stop:  # tyro has printed the help or what is wrong
+        return tell_usage(error.problems)
+    except SystemExit as stop:
         return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
-    return _run(spec, arguments)
-
-
-def _run(spec: Any, arguments: Arguments) -> int:
-    """Generate and tell how it went."""
-    from datagen.folders import parse_slice
-    from datagen.formats import MeshError
-    from datagen.runs import generate
-    from datagen.writer import FrameFileError
-
-    try:
-        part = None if arguments.slice is None else parse_slice(arguments.slice)
-        result = generate(spec, arguments.out, arguments.workers, is_quiet=False, part=part)
-    except (SpecError, MeshError) as error:
-        return _usage(str(error).splitlines())
-    except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILURES
-    except KeyboardInterrupt:
-        print("interrupted; the same command finishes the rest", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    print(f"{result.made} frames made, {result.kept} kept, {len(result.failed)} failed in {result.folder}")
-    if result.contact_sheet is not None:
-        print(f"contact sheet: {result.contact_sheet}")
-    for index, reason in result.failed:
-        print(f"failed frame {index}: {reason}", file=sys.stderr)
-    for name, reason in result.refused:
-        print(f"refused {name}: {reason}", file=sys.stderr)
-    return EXIT_DONE if result.is_complete else EXIT_FAILURES
+    return make_dataset(spec, arguments.out, arguments.workers, arguments.slice)
 
 
 def _defaults(words: Sequence[str]) -> Any:
@@ -142,13 +126,6 @@ def _paths_given(words: Sequence[str]) -> dict[str, Any]:
             elif word.startswith(f"--{name}="):
                 found[name] = word.split("=", 1)[1]
     return found
-
-
-def _usage(problems: Sequence[str]) -> int:
-    """Print what is wrong, a line each, and return the exit code."""
-    for problem in problems:
-        print(f"error: {problem}", file=sys.stderr)
-    return EXIT_USAGE
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
-sequences, shapes, patterns, stages, casts, scenes, samples, pictures, writer, folders, listed_files, manifest, shards,
-entries, executors, progress, dataset, report, runs, checks, flow_files, layouts, picture_store, export,
+sequences, shapes, patterns, stages, casts, scenes, samples, sensor, pictures, writer, folders, listed_files, manifest,
+shards, entries, executors, progress, dataset, report, runs, checks, flow_files, layouts, picture_store, export,
 commands, __main__.
 """
 

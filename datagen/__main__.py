@@ -58,6 +58,26 @@ class Arguments:
     """A file for each thing, or tar files as WebDataset has them; auto: tar files from 1,000 frames on."""
     frames_per_shard: int = 100
     """Frames of a tar file."""
+    sensor: Literal["off", "srgb", "gamma"] = "off"
+    """Take the 8-bit pictures with a camera of this response; the linear images stay as they are."""
+    sensor_gamma: float = 2.2
+    """Of the response gamma: light to the power 1 / (gamma + shoulder * light)."""
+    sensor_shoulder: float = 0.0
+    """See there."""
+    sensor_gain: float = 1.0
+    """Gain before what is too bright is clipped."""
+    sensor_gain_stops: float = 0.0
+    """By how many stops the gain may differ from clip to clip."""
+    sensor_photons: float = 0.0
+    """Photons that fill a pixel, for shot noise; 0 for none."""
+    sensor_read_noise: float = 0.0
+    """Standard deviation of read noise, as a share of a full pixel."""
+    sensor_noise_stops: float = 0.0
+    """By how many stops of sensitivity the noise may differ from clip to clip."""
+    sensor_mosaic: bool = False
+    """Each pixel sees one colour of a Bayer filter, the others are interpolated."""
+    sensor_sharp_noise: bool = False
+    """Noise in the sharp pictures too."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
     slice: str | None = None

@@ -1,14 +1,17 @@
 """Colour spaces: linear light to and from the sRGB curve, and to a power curve (the only door to kornia).
 
 Before: nothing.  After: patterns.py, assets.py (sRGB in), writer.py and report.py (sRGB out),
-export.py (power out).
+export.py (power out), sensor.py (mosaics).
 """
 
 from __future__ import annotations
 
 import torch
-from kornia.color import linear_rgb_to_rgb, rgb_to_linear_rgb
+from kornia.color import CFA, linear_rgb_to_rgb, raw_to_rgb, rgb_to_linear_rgb, rgb_to_raw
 from torch import Tensor
+
+# Colours of a mosaic's first row and of its second; kornia names them by OpenCV's custom, from pixel (1, 1).
+MOSAICS = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
 
 
 def srgb_from_linear(rgb: Tensor) -> Tensor:
@@ -37,3 +40,19 @@ def gamma_bytes_from_linear(rgb: Tensor) -> Tensor:
     """
     coded = rgb.to(torch.float64).clamp(0, 1) ** (1 / 2.2)
     return (coded * 255).round().to(torch.uint8)
+
+
+def mosaic(rgb: Tensor, pattern: str) -> Tensor:
+    """Return (H, W), at each pixel of (H, W, 3) the colour that a filter of `pattern`, one of MOSAICS, lets through.
+
+    H and W are even. Source: Bayer's filter, as in kornia.
+    """
+    return rgb_to_raw(image=rgb.permute(2, 0, 1), cfa=MOSAICS[pattern])[0]
+
+
+def demosaic(raw: Tensor, pattern: str) -> Tensor:
+    """Return (H, W, 3) colours of an (H, W) mosaic of `pattern`, one of MOSAICS; H and W are even.
+
+    Source: bilinear interpolation, as in kornia.
+    """
+    return raw_to_rgb(image=raw[None, None], cfa=MOSAICS[pattern])[0].permute(1, 2, 0)

@@ -32,9 +32,9 @@ CONVENTIONS = {
     "flow_exposure": "from the shutter's opening to its closing, of the point seen at the sharp instant",
     "sharp": "the instant in the middle of the exposure",
     "blur": "mean light of the exposure",
-    "sharp, blur": "sRGB curve",
-    "sharp_gamma, blur_gamma": "power 1/2.2",
 }
+LIGHT_CONVENTIONS = {"sharp, blur": "sRGB curve", "sharp_gamma, blur_gamma": "power 1/2.2"}
+CAMERA_CONVENTIONS = {"pictures": "as the camera of the data set's metadata took them"}
 
 
 class ExportError(ValueError):
@@ -87,6 +87,7 @@ def export_dataset(
         need_lmdb()
     if suffix:
         encode_flow(np.zeros((1, 1, 2), np.float32), suffix)  # an optional package is missed now, not in the middle
+    has_camera = run["spec"].get("sensor", "off") != "off"
     record = {
         "format": 1,
         "layout": layout,
@@ -94,10 +95,10 @@ def export_dataset(
         "flow_suffix": suffix,
         "config_sha256": run["config_sha256"],
         "torchblur_version": run["torchblur_version"],
-        "conventions": CONVENTIONS,
+        "conventions": CONVENTIONS | (CAMERA_CONVENTIONS if has_camera else LIGHT_CONVENTIONS),
     }
     _claim(out, record)
-    job = _Job(folder, out, form, split, suffix, entries)
+    job = _Job(folder, out, form, split, suffix, entries, has_camera)
     files = _write_files(job) + _write_stores(job, run) + _write_list(job, run)
     _write_record(out, record | {"frames": len(entries), "files": files, "is_finished": True})
     return ExportResult(out, len(entries), files)
@@ -113,6 +114,7 @@ class _Job:
     split: str
     suffix: str
     entries: dict[int, dict[str, Any]]
+    has_camera: bool  # a camera took the pictures: there is no other picture of the frame then
 
 
 def _request_problems(layout: str, split: str | None, flow_suffix: str | None) -> list[str]:
@@ -195,8 +197,9 @@ def _write_files(job: _Job) -> int:
 
 def _content(job: _Job, entry: dict[str, Any], content: str, frame: dict[str, Any]) -> bytes:
     """Return one content of one frame as the bytes of a file."""
-    if content in PICTURES:
-        return read_listed_file(job.folder, entry, frame_paths(entry["index"])[content])
+    stored = content.removesuffix("_gamma") if job.has_camera else content
+    if stored in PICTURES:
+        return read_listed_file(job.folder, entry, frame_paths(entry["index"])[stored])
     if content in CODED:
         linear = frame["sharp" if content == "sharp_gamma" else "blurred"]
         return encode_png(gamma_bytes_from_linear(linear.permute(1, 2, 0)).numpy())

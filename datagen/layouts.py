@@ -6,7 +6,8 @@ whole data set, from 0; flow the suffix of flow files.
 
 Contents:
 - `sharp`, `blur`: 8-bit pictures on the sRGB curve, the bytes of the data set's own PNGs;
-- `sharp_gamma`, `blur_gamma`: 8-bit pictures of the linear images to the power 1/2.2;
+- `sharp_gamma`, `blur_gamma`: 8-bit pictures of the linear images to the power 1/2.2; where a camera took the data
+  set's PNGs, these;
 - `flow_next`, `flow_previous`: motion to the neighbour frame's sharp instant, only where the clip has that frame;
 - `flow_exposure`: motion from the shutter's opening to its closing.
 

@@ -1,6 +1,6 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: scenes.py, samples.py, writer.py, manifest.py, shards.py, executors.py, report.py.  After: __main__.py.
+Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py.  After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
 
@@ -16,8 +16,9 @@ from datagen.folders import Slice, locked_folder, one_at_a_time, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.report import write_contact_sheet
-from datagen.samples import make_sample
+from datagen.samples import Sample, make_sample
 from datagen.scenes import Plan, plan_from_json, survey_assets
+from datagen.sensor import photograph
 from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
 from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import write_atomically, write_frame
@@ -113,13 +114,18 @@ def generate(
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:
     """Make and write one frame: the task that executors run for storage `folder`. Source: ours."""
-    return json.dumps({"entries": [write_frame(folder, index, make_sample(plan_json, index))], "failed": []})
+    return json.dumps({"entries": [write_frame(folder, index, _take(plan_json, index))], "failed": []})
 
 
 def make_shard(plan_json: str, folder: str, number: int) -> str:
     """Make and write one shard: the task that executors run for storage `shards`. Source: ours."""
-    made, failed = write_shard(folder, number, plan_from_json(plan_json), lambda index: make_sample(plan_json, index))
+    made, failed = write_shard(folder, number, plan_from_json(plan_json), lambda index: _take(plan_json, index))
     return json.dumps({"entries": made, "failed": failed})
+
+
+def _take(plan_json: str, index: int) -> Sample:
+    """Return a frame's sample with its pictures."""
+    return photograph(make_sample(plan_json, index), plan_from_json(plan_json).spec, index)
 
 
 @dataclass(frozen=True)

@@ -48,6 +48,7 @@ class Sample:
     face_id: Tensor  # (H, W) int64, -1 where nothing is
     coverage: Tensor  # (H, W, M) share of the exposure
     meta: dict[str, Any]  # JSON values
+    pictures: dict[str, Tensor] | None = None  # `sharp` and `blur`, (H, W, 3) uint8; none: on the sRGB curve
 
 
 @dataclass(frozen=True)

@@ -75,10 +75,12 @@ def frame_contents(sample: Sample) -> dict[str, bytes]:
 
     Source: ours.
     """
+    images = {"sharp": sample.sharp, "blur": sample.blurred}
+    pictures = sample.pictures or {name: bytes_from_linear(image[..., :3]) for name, image in images.items()}
     return {
         "exr": encode_exr(sample_parts(sample), sample.meta),
-        "sharp": encode_png(bytes_from_linear(sample.sharp[..., :3]).numpy()),
-        "blur": encode_png(bytes_from_linear(sample.blurred[..., :3]).numpy()),
+        "sharp": encode_png(pictures["sharp"].numpy()),
+        "blur": encode_png(pictures["blur"].numpy()),
     }
 
 

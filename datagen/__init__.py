@@ -3,7 +3,7 @@
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
 sequences, shapes, patterns, stages, casts, scenes, samples, sensor, pictures, writer, folders, listed_files, manifest,
 shards, entries, executors, progress, dataset, report, runs, checks, flow_files, layouts, picture_store, export,
-commands, __main__.
+pages, commands, __main__.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ class Arguments:
     """Generate sharp and exactly motion-blurred images with motion, depth, masks and ids.
 
     Stopped or killed, the same command finishes the rest; the bytes depend neither on that nor on the workers.
-    Other commands: init, status, verify, retry, export, inspect; each has its own --help.
+    Other commands: init, status, verify, retry, export, inspect, report; each has its own --help.
     """
 
     out: str

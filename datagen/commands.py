@@ -124,6 +124,26 @@ class Export:
 
 
 @dataclass(frozen=True)
+class Report:
+    """Write one HTML page about a data set: counts, failures, distributions, samples."""
+
+    folder: str
+    """Of the data set."""
+    out: str | None = None
+    """File to write; `report.html` in the folder if not given."""
+
+    def run(self) -> int:
+        """Write the page. Source: ours."""
+        from datagen.checks import read_status
+        from datagen.pages import write_page
+
+        if not read_status(self.folder).finished:
+            return tell_usage([f"folder: expected at least one finished frame, got none in {self.folder!r}"])
+        print(write_page(self.folder, Path(self.folder) / "report.html" if self.out is None else self.out))
+        return EXIT_DONE
+
+
+@dataclass(frozen=True)
 class Inspect:
     """Print what a frame holds: parts, channels, ranges, metadata."""
 
@@ -165,7 +185,15 @@ class Inspect:
         return EXIT_DONE
 
 
-COMMANDS = {"init": Init, "status": Status, "verify": Verify, "retry": Retry, "export": Export, "inspect": Inspect}
+COMMANDS = {
+    "init": Init,
+    "status": Status,
+    "verify": Verify,
+    "retry": Retry,
+    "export": Export,
+    "inspect": Inspect,
+    "report": Report,
+}
 
 
 def run_command(command: Any) -> int:

@@ -165,7 +165,10 @@ def test_every_command_has_help_that_does_not_wait_for_torch():
 
 def test_a_wrong_command_is_refused_and_the_right_ones_are_named(tmp_path, capsys):
     assert main(["verfy", str(tmp_path)]) == 2
-    assert "command: expected one of generate, init, status, verify, retry, export, inspect" in capsys.readouterr().err
+    assert (
+        "command: expected one of generate, init, status, verify, retry, export, inspect, report"
+        in capsys.readouterr().err
+    )
     assert main(["verify"]) == 2
     for name in ("status", "verify", "retry"):
         assert main([name, str(tmp_path / "nothing")]) == 2, name

@@ -49,6 +49,12 @@ def test_a_frame_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_
         list(run_processes(task_that_dies_at_1, "", "", range(1), 0))
 
 
+def test_a_worker_watches_over_its_driver_before_it_imports_torch():
+    program = "import sys, datagen.executors, datagen.__main__; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_a_failing_frame_gives_exit_code_1_and_is_made_by_a_rerun(tmp_path, monkeypatch, capsys):
     real = datagen.runs.make_sample
 

@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -5,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from datagen.__main__ import NOT_IN_THE_SPEC, Arguments
 from datagen.seeds import open_stream
 from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields
 
@@ -64,6 +66,12 @@ def test_a_toml_file_gives_the_fields(tmp_path):
     path.write_text("width = [", encoding="utf-8")
     with pytest.raises(SpecError, match="config: expected"):
         read_spec_fields(path)
+
+
+def test_every_field_can_be_set_on_the_command_line():
+    flags = {field.name: field.default for field in dataclasses.fields(Arguments)}
+    assert set(flags) - set(NOT_IN_THE_SPEC) == set(DatasetSpec.model_fields)
+    assert all(flags[name] == field.default for name, field in DatasetSpec.model_fields.items())
 
 
 def test_a_specification_cannot_be_changed():

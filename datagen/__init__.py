@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from datagen.dataset import BlurDataset
     from datagen.export import ExportError, ExportResult, export_dataset
     from datagen.flow_files import FlowFileError, encode_flow, read_flow
+    from datagen.folders import Slice
     from datagen.formats import MeshError
     from datagen.manifest import ManifestError
     from datagen.runs import RunResult, generate
@@ -33,6 +34,7 @@ _HOMES = {
     "ManifestError": "manifest",
     "MeshError": "formats",
     "RunResult": "runs",
+    "Slice": "folders",
     "SpecError": "spec",
     "Status": "checks",
     "encode_flow": "flow_files",
@@ -53,6 +55,7 @@ __all__ = [
     "ManifestError",
     "MeshError",
     "RunResult",
+    "Slice",
     "SpecError",
     "Status",
     "encode_flow",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.executors import Outcome, Task, run_processes, run_serial
-from datagen.folders import Slice, locked_folder, one_at_a_time, settle_storage
+from datagen.folders import Slice, locked_folder, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.report import write_contact_sheet
@@ -147,8 +147,7 @@ def _begin(folder: Path, plan: Plan, part: Slice | None) -> _Run:
         todo = [i for i in range(spec.count) if i not in holdings.entries]
         return _Run(make_frame, todo, holdings, spec.count, plan)
     mine = run_shards(spec, part)
-    with one_at_a_time(folder):
-        holdings = begin_shards(folder, plan, part)
+    holdings = begin_shards(folder, plan, part)
     todo = [number for number in mine if shard_frames(spec, number)[0] not in holdings.entries]
     return _Run(make_shard, todo, holdings, sum(len(shard_frames(spec, number)) for number in mine), plan)
 

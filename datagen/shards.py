@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from datagen.folders import RUN_NAME, SHARD_FOLDER, Slice, check_run, record_sum, sweep, write_run
+from datagen.folders import RUN_NAME, SHARD_FOLDER, Slice, check_run, one_at_a_time, record_sum, sweep, write_run
 from datagen.listed_files import entry_damage, file_damage, read_listed_file
 from datagen.manifest import Holdings, ManifestError
 from datagen.samples import Sample
@@ -74,15 +74,16 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
 
     Source: ours.
     """
-    check_run(folder, plan)
-    (folder / SHARD_FOLDER).mkdir(exist_ok=True)
     numbers = run_shards(plan.spec, part)
-    if part is None:
-        sweep((folder, folder / SHARD_FOLDER))
-    else:  # other slices may be at work on the other shards
-        sweep((folder / SHARD_FOLDER,), [Path(path(n)).name for n in numbers for path in (tar_path, marker_path)])
-        sweep((folder,), (RUN_NAME, f"*-{part.number}-of-{part.of}.json"))
-    write_run(folder, plan)
+    with one_at_a_time(folder):
+        check_run(folder, plan)
+        (folder / SHARD_FOLDER).mkdir(exist_ok=True)
+        if part is None:
+            sweep((folder, folder / SHARD_FOLDER))
+        else:  # other slices may be at work on the other shards
+            sweep((folder / SHARD_FOLDER,), [Path(path(n)).name for n in numbers for path in (tar_path, marker_path)])
+            sweep((folder,), (RUN_NAME, f"*-{part.number}-of-{part.of}.json"))
+        write_run(folder, plan)
     entries: dict[int, dict[str, Any]] = {}
     damaged: dict[int, str] = {}
     notes = []

@@ -1,8 +1,9 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
-sequences, shapes, patterns, stages, casts, scenes, baselines/, samples, pictures, writer, manifest, executors,
-progress, dataset, report, runs, __main__.
+sequences, shapes, patterns, stages, casts, scenes, baselines/, samples, sensor, pictures, writer, folders,
+listed_files, manifest, shards, entries, executors, progress, dataset, report, runs, checks, flow_files, layouts,
+picture_store, export, pages, commands, __main__.
 """
 
 from __future__ import annotations
@@ -11,9 +12,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datagen.checks import Status, read_status, verify_dataset
     from datagen.dataset import BlurDataset
+    from datagen.export import ExportError, ExportResult, export_dataset
+    from datagen.flow_files import FlowFileError, encode_flow, read_flow
+    from datagen.folders import Slice
     from datagen.formats import MeshError
-    from datagen.manifest import ManifestError, verify_dataset
+    from datagen.manifest import ManifestError
     from datagen.runs import RunResult, generate
     from datagen.spec import DatasetSpec, SpecError, parse_spec
     from datagen.writer import FrameFileError
@@ -22,25 +27,43 @@ if TYPE_CHECKING:
 _HOMES = {
     "BlurDataset": "dataset",
     "DatasetSpec": "spec",
+    "ExportError": "export",
+    "ExportResult": "export",
+    "FlowFileError": "flow_files",
     "FrameFileError": "writer",
     "ManifestError": "manifest",
     "MeshError": "formats",
     "RunResult": "runs",
+    "Slice": "folders",
     "SpecError": "spec",
+    "Status": "checks",
+    "encode_flow": "flow_files",
+    "export_dataset": "export",
     "generate": "runs",
     "parse_spec": "spec",
-    "verify_dataset": "manifest",
+    "read_flow": "flow_files",
+    "read_status": "checks",
+    "verify_dataset": "checks",
 }
 __all__ = [
     "BlurDataset",
     "DatasetSpec",
+    "ExportError",
+    "ExportResult",
+    "FlowFileError",
     "FrameFileError",
     "ManifestError",
     "MeshError",
     "RunResult",
+    "Slice",
     "SpecError",
+    "Status",
+    "encode_flow",
+    "export_dataset",
     "generate",
     "parse_spec",
+    "read_flow",
+    "read_status",
     "verify_dataset",
 ]
 

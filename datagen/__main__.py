@@ -1,8 +1,7 @@
-"""Command line: `python -m datagen --out DIR --count N …` (the only door to tyro).
+"""Command line: `python -m datagen [generate] --out DIR …` and the commands of commands.py (the only door to tyro).
 
-Before: spec.py, runs.py.  After: nothing.
-Exit codes: 0 all done; 1 frames failed or assets were refused, which are listed; 2 wrong usage or configuration;
-130 interrupted. Starting the same command again finishes what is missing.
+Before: spec.py, commands.py.  After: nothing.
+Starting the same command again finishes what is missing. The exit codes are in commands.py.
 """
 
 from __future__ import annotations
@@ -14,10 +13,11 @@ from typing import Any, Literal
 
 import tyro
 
+from datagen.commands import COMMANDS, EXIT_DONE, EXIT_USAGE, make_dataset, run_command, tell_usage
 from datagen.spec import SpecError, parse_spec, read_spec_fields
 
-EXIT_DONE, EXIT_FAILURES, EXIT_USAGE, EXIT_INTERRUPTED = 0, 1, 2, 130
-NOT_IN_THE_SPEC = ("out", "workers", "config")
+PROGRAM = "python -m datagen"
+NOT_IN_THE_SPEC = ("out", "workers", "slice", "config")
 
 
 @dataclass(frozen=True)
@@ -25,12 +25,13 @@ class Arguments:
     """Generate sharp and exactly motion-blurred images with motion, depth, masks and ids.
 
     Stopped or killed, the same command finishes the rest; the bytes depend neither on that nor on the workers.
+    Other commands: init, status, verify, retry, export, inspect, report; each has its own --help.
     """
 
     out: str
     """Folder of the data set; created if need be."""
     config: str | None = None
-    """TOML file with any of the options below but --workers; options given here win."""
+    """TOML file with any of the options below but --workers and --slice; options given here win."""
     count: int = 16
     """Number of frames."""
     width: int = 256
@@ -56,8 +57,34 @@ class Arguments:
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""
+    storage: Literal["auto", "folder", "shards"] = "auto"
+    """A file for each thing, or tar files as WebDataset has them; auto: tar files from 1,000 frames on."""
+    frames_per_shard: int = 100
+    """Frames of a tar file."""
+    sensor: Literal["off", "srgb", "gamma"] = "off"
+    """Take the 8-bit pictures with a camera of this response; the linear images stay as they are."""
+    sensor_gamma: float = 2.2
+    """Of the response gamma: light to the power 1 / (gamma + shoulder * light)."""
+    sensor_shoulder: float = 0.0
+    """See there."""
+    sensor_gain: float = 1.0
+    """Gain before what is too bright is clipped."""
+    sensor_gain_stops: float = 0.0
+    """By how many stops the gain may differ from clip to clip."""
+    sensor_photons: float = 0.0
+    """Photons that fill a pixel, for shot noise; 0 for none."""
+    sensor_read_noise: float = 0.0
+    """Standard deviation of read noise, as a share of a full pixel."""
+    sensor_noise_stops: float = 0.0
+    """By how many stops of sensitivity the noise may differ from clip to clip."""
+    sensor_mosaic: bool = False
+    """Each pixel sees one colour of a Bayer filter, the others are interpolated."""
+    sensor_sharp_noise: bool = False
+    """Noise in the sharp pictures too."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
+    slice: str | None = None
+    """Make part i of n, as `3/100`; the other parts may run elsewhere at the same time. Needs --storage shards."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -69,48 +96,31 @@ def main(argv: Sequence[str] | None = None) -> int:
     Source: ours.
     """
     words = list(sys.argv[1:] if argv is None else argv)
+    name = words[0] if words and not words[0].startswith("-") else "generate"
+    if name in COMMANDS:
+        try:
+            configured = tyro.conf.configure(tyro.conf.PositionalRequiredArgs, tyro.conf.FlagConversionOff)
+            command = tyro.cli(configured(COMMANDS[name]), prog=f"{PROGRAM} {name}", args=words[1:])
+        except SystemExit as stop:  # tyro has printed the help or what is wrong
+            return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
+        return run_command(command)
+    if name != "generate":
+        return tell_usage([f"command: expected one of generate, {', '.join(COMMANDS)}, got {name!r}"])
+    words = words[words[:1] == ["generate"] :]
     try:
         arguments = tyro.cli(
             tyro.conf.configure(tyro.conf.FlagConversionOff)(Arguments),
-            prog="python -m datagen",
+            prog=PROGRAM,
             args=words,
             default=_defaults(words),
         )
         chosen = {f.name: getattr(arguments, f.name) for f in fields(arguments) if f.name not in NOT_IN_THE_SPEC}
         spec = parse_spec(chosen)
     except SpecError as error:
-        return _usage(error.problems)
-    except SystemExit as stop:  # tyro has printed the help or what is wrong
+        return tell_usage(error.problems)
+    except SystemExit as stop:
         return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
-    return _run(spec, arguments)
-
-
-def _run(spec: Any, arguments: Arguments) -> int:
-    """Generate and tell how it went."""
-    from datagen.formats import MeshError
-    from datagen.runs import generate
-    from datagen.writer import FrameFileError
-
-    try:
-        result = generate(spec, arguments.out, arguments.workers, is_quiet=False)
-    except (SpecError, MeshError) as error:
-        return _usage(str(error).splitlines())
-    except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again
-        print(f"error: {error}", file=sys.stderr)
-        return EXIT_FAILURES
-    except KeyboardInterrupt:
-        print("interrupted; the same command finishes the rest", file=sys.stderr)
-        return EXIT_INTERRUPTED
-    print(f"{result.made} frames made, {result.kept} kept, {len(result.failed)} failed in {result.folder}")
-    if result.effects:
-        print("effects, in share of the frames: " + ", ".join(f"{n} {s:.0%}" for n, s in result.effects.items()))
-    if result.contact_sheet is not None:
-        print(f"contact sheet: {result.contact_sheet}")
-    for index, reason in result.failed:
-        print(f"failed frame {index}: {reason}", file=sys.stderr)
-    for name, reason in result.refused:
-        print(f"refused {name}: {reason}", file=sys.stderr)
-    return EXIT_DONE if result.is_complete else EXIT_FAILURES
+    return make_dataset(spec, arguments.out, arguments.workers, arguments.slice)
 
 
 def _defaults(words: Sequence[str]) -> Any:
@@ -139,13 +149,6 @@ def _paths_given(words: Sequence[str]) -> dict[str, Any]:
             elif word.startswith(f"--{name}="):
                 found[name] = word.split("=", 1)[1]
     return found
-
-
-def _usage(problems: Sequence[str]) -> int:
-    """Print what is wrong, a line each, and return the exit code."""
-    for problem in problems:
-        print(f"error: {problem}", file=sys.stderr)
-    return EXIT_USAGE
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Dataset: what was written, as tensors for training.
 
-Before: writer.py, manifest.py.  After: report.py and people's training code.
+Before: writer.py, entries.py.  After: report.py and people's training code.
 Images leave as (C, H, W) float32. Symbols: H, W image size.
 """
 
@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from datagen.manifest import read_manifest
-from datagen.writer import FrameFileError, frame_paths, read_exr
+from datagen.entries import read_entries
+from datagen.listed_files import read_listed_file
+from datagen.writer import FrameFileError, decode_exr, frame_paths
 
 # name -> (part, channels)
 PLANES: dict[str, tuple[str, tuple[str, ...]]] = {
@@ -34,7 +35,7 @@ IDS = {"mesh_id": "id.mesh", "face_id": "id.face"}
 
 
 class BlurDataset(Dataset[dict[str, Any]]):
-    """The finished frames of a folder, in the order of their numbers.
+    """The finished frames of a folder, in the order of their numbers, also while more are being written.
 
     An item is a dict of tensors: `sharp`, `blurred` (3, H, W) linear RGB; `motion` (2, H, W) [px, x right, y down]
     over the exposure, `motion_next` and `motion_previous` to the neighbour frames' sharp instants (NaN where the
@@ -61,7 +62,7 @@ class BlurDataset(Dataset[dict[str, Any]]):
     def __init__(self, folder: str | Path, keys: Sequence[str] | None = None) -> None:
         self.folder = Path(folder)
         try:
-            entries = read_manifest(folder)
+            entries = read_entries(folder)
         except FileNotFoundError:
             raise FileNotFoundError(f"folder: expected a data set with a manifest.jsonl, got {str(folder)!r}") from None
         names = sorted(set.intersection(*(set(e.get("baselines", ())) for e in entries.values()))) if entries else []
@@ -72,8 +73,10 @@ class BlurDataset(Dataset[dict[str, Any]]):
             raise ValueError(f"keys: expected some of {', '.join(known)}, got {', '.join(unknown)}")
         self.keys = tuple(known if keys is None else keys)
         self.indices = tuple(entries)
-        sums = [file["sha256"] for e in entries.values() for file in e["files"] if file["path"].endswith(".exr")]
-        self._sums = np.array(sums, dtype="S64")  # one array, as millions of texts would be slow to send to workers
+        files = [file for e in entries.values() for file in e["files"] if file["path"].endswith(".exr")]
+        # One array, as millions of texts would be slow to send to workers.
+        rows = [(file["sha256"], file["bytes"], file.get("tar", ""), file.get("offset", 0)) for file in files]
+        self._files = np.array(rows, dtype=[("sha256", "S64"), ("bytes", "i8"), ("tar", "S24"), ("offset", "i8")])
         if not self.indices:
             raise ValueError(f"folder: expected at least one finished frame, got none in {str(folder)!r}")
 
@@ -121,8 +124,13 @@ class BlurDataset(Dataset[dict[str, Any]]):
 
     def _read(self, item: int) -> tuple[Path, dict[str, dict[str, np.ndarray]], dict[str, Any]]:
         """Return a frame's path, parts and metadata, its bytes checked against the manifest."""
-        path = self.folder / frame_paths(self.indices[item])["exr"]
-        return (path, *read_exr(path, self._sums[item].decode()))
+        index, (sha256, size, tar, offset) = self.indices[item], self._files[item].tolist()
+        path = frame_paths(index)["exr"]
+        file: dict[str, Any] = {"path": path, "sha256": sha256.decode(), "bytes": size}
+        if tar:
+            file |= {"tar": tar.decode(), "offset": offset}
+        data = read_listed_file(self.folder, {"files": [file]}, path)
+        return (self.folder / path, *decode_exr(data, str(self.folder / path)))
 
 
 def _stack(parts: dict[str, dict[str, np.ndarray]], part: str, channels: tuple[str, ...]) -> Tensor:

@@ -17,8 +17,7 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
-import torch
-
+# torch is imported in functions: a new process must watch over the driver before it spends seconds on that.
 MAX_TRIES = 3  # of a frame whose process died; an exception is not tried again, as it would come again
 
 Task = Callable[[str, str, int], str]  # (plan, folder, index) -> text
@@ -38,6 +37,8 @@ def run_serial(task: Task, plan_json: str, folder: str, indices: Iterable[int]) 
 
     Source: ours.
     """
+    import torch
+
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -130,10 +131,12 @@ def _end_pool(pool: ProcessPoolExecutor, is_idle: bool) -> None:
 
 
 def _begin_process() -> None:
-    """Prepare a worker: one torch thread, the interrupt left to the driver, and no life after the driver's."""
-    torch.set_num_threads(1)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Prepare a worker: no life after the driver's, the interrupt left to the driver, one torch thread."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    import torch
+
+    torch.set_num_threads(1)
 
 
 def _end_with_parent() -> None:

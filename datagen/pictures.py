@@ -1,6 +1,6 @@
 """Pictures: 8-bit PNG and labels (the only door to Pillow).
 
-Before: nothing.  After: writer.py, report.py.
+Before: nothing.  After: writer.py, report.py, pages.py.
 """
 
 from __future__ import annotations
@@ -24,6 +24,12 @@ def encode_png(pixels: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(np.ascontiguousarray(pixels)).save(buffer, format="PNG", compress_level=6)
     return buffer.getvalue()
+
+
+def decode_png(data: bytes) -> np.ndarray:
+    """Return the (H, W, 3) uint8 pixels of what `encode_png` returned. Source: ours."""
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        return np.asarray(image)
 
 
 def write_labels(pixels: np.ndarray, labels: list[tuple[int, int, str]], shade: int = 40) -> np.ndarray:

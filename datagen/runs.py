@@ -1,6 +1,7 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: scenes.py, samples.py, writer.py, manifest.py, executors.py, report.py.  After: __main__.py.
+Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py.  After: commands.py.
+A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
 
 from __future__ import annotations
@@ -8,13 +9,17 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
-from datagen.executors import run_processes, run_serial
-from datagen.manifest import append_entry, begin_run, locked_folder, write_manifest
+from datagen.executors import Outcome, Task, run_processes, run_serial
+from datagen.folders import Slice, locked_folder, settle_storage
+from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.report import effect_shares, write_contact_sheet
-from datagen.samples import make_sample
-from datagen.scenes import Plan, survey_assets
+from datagen.samples import Sample, make_sample
+from datagen.scenes import Plan, plan_from_json, survey_assets
+from datagen.sensor import photograph
+from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
 from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import write_atomically, write_frame
 
@@ -26,7 +31,7 @@ class RunResult:
     """What a run achieved."""
 
     folder: Path
-    made: int  # frames made by this run
+    made: int  # frames made by this run, and those put once more into a shard that had to be completed
     kept: int  # frames found finished
     failed: tuple[tuple[int, str], ...]  # (frame, reason)
     refused: tuple[tuple[str, str], ...]  # (asset, reason)
@@ -40,72 +45,131 @@ class RunResult:
         return not self.failed and not self.refused
 
 
-def generate(spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: bool = True) -> RunResult:
+def generate(
+    spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: bool = True, part: Slice | None = None
+) -> RunResult:
     """Make the data set, or what is missing of it, and return what was achieved.
 
-    The bytes of the frames and of the final manifest depend on the specification and the assets only.
+    The bytes of the frames and of the final lists depend on the specification and the assets only.
 
     Args:
         spec: what to make.
-        out: folder; created if need be. Finished frames in it are kept if every byte is as the manifest lists it;
-            the others are made again.
+        out: folder; created if need be. Finished frames in it are kept if every byte is as listed; the others are
+            made again.
         workers: processes; 0 and 1 work in this one.
         is_quiet: show no progress on stderr.
+        part: make these shards only; other slices may be made at the same time. Needs storage `shards`.
 
     Raises:
-        SpecError: the folder holds other data, is held by another run, or `workers` is negative.
+        SpecError: the folder holds other data, is held by another run, or `workers` is negative, or a slice of what
+            is not stored in shards is asked for.
         MeshError: none of the assets can be used; nothing has been written then.
 
     Source: ours.
     """
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
         raise SpecError([f"workers: expected an integer of at least 0, got {workers!r}"])
+    spec = settle_storage(spec, Path(out))
+    if part is not None and spec.storage != "shards":
+        raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
     roster = survey_assets(spec)
     plan = Plan(spec, roster.names, roster.sha256)
-    with locked_folder(out) as folder:
-        holdings = begin_run(folder, plan)
-        entries, kept = holdings.entries, len(holdings.entries)
-        repaired = [f"{note}; made again if a frame was lost with it" for note in holdings.notes]
-        todo = [i for i in range(spec.count) if i not in entries]
+    with locked_folder(out, part) as folder:
+        run = _begin(folder, plan, part)
+        entries, kept = run.holdings.entries, len(run.holdings.entries)
+        repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
         failed = []
-        with Progress(spec.count, kept, is_quiet) as progress:
+        with Progress(run.total, kept, is_quiet) as progress:
             if roster.refused:
                 progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
             for line in repaired:
                 progress.say(line)
             text = plan.to_json()
             if workers <= 1:
-                outcomes = run_serial(make_frame, text, str(folder), todo)
+                outcomes = run_serial(run.task, text, str(folder), run.todo)
             else:
-                outcomes = run_processes(make_frame, text, str(folder), todo, min(workers, max(len(todo), 1)))
+                outcomes = run_processes(run.task, text, str(folder), run.todo, min(workers, max(len(run.todo), 1)))
             for outcome in outcomes:
-                if outcome.error:
-                    failed.append((outcome.index, outcome.error))
-                    progress.say(f"failed frame {outcome.index}: {outcome.error}")
-                else:
-                    entries[outcome.index] = json.loads(outcome.text)
-                    append_entry(folder, entries[outcome.index])
-                    if outcome.index in holdings.damaged:
-                        repaired.append(f"frame {outcome.index}: {holdings.damaged[outcome.index]}; made again")
+                made, lost = _frames_of(outcome, run)
+                failed += lost
+                for index, reason in lost:
+                    progress.say(f"failed frame {index}: {reason}")
+                    progress.step(is_done=False)
+                for entry in made:
+                    index = entry["index"]
+                    entries[index] = entry
+                    if run.task is make_frame:
+                        append_entry(folder, entry)
+                    if index in run.holdings.damaged:
+                        repaired.append(f"frame {index}: {run.holdings.damaged[index]}; made again")
                         progress.say(repaired[-1])
-                progress.step(not outcome.error)
-        write_manifest(folder, entries)
+                    progress.step(is_done=True)
+        if run.task is make_frame:
+            write_manifest(folder, entries)
         failed.sort()
-        _write_failures(folder, failed, list(roster.refused))
-        sheet = write_contact_sheet(folder) if entries else None
-    made = len(entries) - kept
-    shares = effect_shares(entries.values())
-    return RunResult(folder, made, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
+        _write_failures(folder, failed, list(roster.refused), part)
+        sheet = write_contact_sheet(folder) if entries and part is None else None
+    made_count, shares = len(entries) - kept, effect_shares(entries.values())
+    return RunResult(folder, made_count, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:
-    """Make and write one frame and return its manifest entry as JSON: the task that executors run. Source: ours."""
-    return json.dumps(write_frame(folder, index, make_sample(plan_json, index)))
+    """Make and write one frame: the task that executors run for storage `folder`. Source: ours."""
+    return json.dumps({"entries": [write_frame(folder, index, _take(plan_json, index))], "failed": []})
 
 
-def _write_failures(folder: Path, failed: list[tuple[int, str]], refused: list[tuple[str, str]]) -> None:
-    """Leave a list of what could not be used or made, or none if there is nothing to list."""
-    place = folder / FAILURES_NAME
+def make_shard(plan_json: str, folder: str, number: int) -> str:
+    """Make and write one shard: the task that executors run for storage `shards`. Source: ours."""
+    made, failed = write_shard(folder, number, plan_from_json(plan_json), lambda index: _take(plan_json, index))
+    return json.dumps({"entries": made, "failed": failed})
+
+
+def _take(plan_json: str, index: int) -> Sample:
+    """Return a frame's sample with its pictures."""
+    return photograph(make_sample(plan_json, index), plan_from_json(plan_json).spec, index)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """What there is to do."""
+
+    task: Task
+    todo: list[int]  # numbers of frames or of shards
+    holdings: Holdings
+    total: int  # frames of this run, those that are there included
+    plan: Plan
+
+
+def _begin(folder: Path, plan: Plan, part: Slice | None) -> _Run:
+    """Prepare a locked folder and return what is missing."""
+    spec = plan.spec
+    if spec.storage == "folder":
+        holdings = begin_run(folder, plan)
+        todo = [i for i in range(spec.count) if i not in holdings.entries]
+        return _Run(make_frame, todo, holdings, spec.count, plan)
+    mine = run_shards(spec, part)
+    holdings = begin_shards(folder, plan, part)
+    todo = [number for number in mine if shard_frames(spec, number)[0] not in holdings.entries]
+    return _Run(make_shard, todo, holdings, sum(len(shard_frames(spec, number)) for number in mine), plan)
+
+
+def _frames_of(outcome: Outcome, run: _Run) -> tuple[list[dict[str, Any]], list[tuple[int, str]]]:
+    """Return the entries and failures, as (frame, reason), of a task."""
+    if not outcome.error:
+        result = json.loads(outcome.text)
+        return result["entries"], [(index, reason) for index, reason in result["failed"]]
+    frames = [outcome.index] if run.task is make_frame else shard_frames(run.plan.spec, outcome.index)
+    return [], [(index, outcome.error) for index in frames]
+
+
+def _write_failures(
+    folder: Path, failed: list[tuple[int, str]], refused: list[tuple[str, str]], part: Slice | None
+) -> None:
+    """Leave a list of what could not be used or made, or none if there is nothing to list. A slice has its own."""
+    place = folder / (f"failures-{part.number}-of-{part.of}.json" if part else FAILURES_NAME)
+    if part is None:  # this run has tried what any slice could not make
+        for old in folder.glob("failures-*-of-*.json"):
+            old.unlink(missing_ok=True)
     if not failed and not refused:
         place.unlink(missing_ok=True)
         return

@@ -51,6 +51,7 @@ class Sample:
     coverage: Tensor  # (H, W, M) share of the exposure
     meta: dict[str, Any]  # JSON values
     baselines: dict[str, Tensor] = field(default_factory=dict)  # by filter: (H, W, 3) linear RGB
+    pictures: dict[str, Tensor] | None = None  # `sharp` and `blur`, (H, W, 3) uint8; none: on the sRGB curve
 
 
 @dataclass(frozen=True)

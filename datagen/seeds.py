@@ -1,6 +1,6 @@
 """Random streams: every clip has its own, found from (seed, stream, clip) alone.
 
-Before: spec.py.  After: scenes.py and what it calls.
+Before: spec.py.  After: scenes.py and what it calls, sensor.py.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 # Each kind of decision draws from its own stream, so that a new kind moves none of the old ones.
-STREAMS = ("stage", "camera", "cast", "motion", "colour", "backdrop")
+STREAMS = ("stage", "camera", "cast", "motion", "colour", "backdrop", "sensor", "noise")
 
 
 def open_stream(seed: int, stream: str, clip: int) -> np.random.Generator:
@@ -17,7 +17,7 @@ def open_stream(seed: int, stream: str, clip: int) -> np.random.Generator:
     Args:
         seed: the data set's seed.
         stream: one of STREAMS.
-        clip: index of the clip, at least 0.
+        clip: index of the clip, for `noise` of the frame; at least 0.
 
     Raises:
         ValueError: an unknown stream.

@@ -22,7 +22,8 @@ else:
 
 SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 BASELINES = ("directional", "mcguire2012", "guertin2014", "guertin2015")  # in baselines/filters.py, which needs torch
-NOT_IN_THE_BYTES = ("count", "assets")  # a longer run extends a shorter one; a folder's place is not its content
+# A longer run extends a shorter one; a folder's place is not its content; storage does not change a frame's files.
+NOT_IN_THE_BYTES = ("count", "assets", "storage", "frames_per_shard")
 
 
 class SpecError(ValueError):
@@ -48,6 +49,18 @@ class DatasetSpec(BaseModel):
         rays_per_pixel: rays inside each pixel, 1 = its centre.
         sequence_fps: at what rate a sequence is played [Hz].
         baselines: filters whose images are stored beside the exact one: names from BASELINES, between commas.
+        storage: `folder` (a file for each thing), `shards` (tar files of many frames, as WebDataset has them) or
+            `auto`: a folder below 1,000 frames.
+        sensor: `off`, or the response of a camera that takes the 8-bit pictures: `srgb` or `gamma`. The linear images
+            stay as they are. The other `sensor_…` fields need one.
+        sensor_gamma, sensor_shoulder: curve of `gamma`: light to the power 1 / (gamma + shoulder · light).
+        sensor_gain, sensor_gain_stops: gain before clipping, and by how many stops it may differ from clip to clip.
+        sensor_photons: photons that fill a pixel, for shot noise; 0 for none.
+        sensor_read_noise: standard deviation, as a share of a full pixel.
+        sensor_noise_stops: by how many stops of sensitivity the noise may differ from clip to clip.
+        sensor_mosaic: each pixel sees one colour, the others are interpolated.
+        sensor_sharp_noise: noise in the sharp pictures too.
+        frames_per_shard: frames of a tar file.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -63,6 +76,18 @@ class DatasetSpec(BaseModel):
     exposure: float = Field(default=0.5, gt=0, le=1, allow_inf_nan=False)
     rays_per_pixel: int = Field(default=4, ge=1, le=4096)
     sequence_fps: float = Field(default=24.0, gt=0, le=1e6, allow_inf_nan=False)
+    storage: Literal["auto", "folder", "shards"] = "auto"
+    frames_per_shard: int = Field(default=100, ge=1, le=10**5)
+    sensor: Literal["off", "srgb", "gamma"] = "off"
+    sensor_gamma: float = Field(default=2.2, gt=0, le=10, allow_inf_nan=False)
+    sensor_shoulder: float = Field(default=0.0, ge=-10, le=10, allow_inf_nan=False)
+    sensor_gain: float = Field(default=1.0, gt=0, le=1e6, allow_inf_nan=False)
+    sensor_gain_stops: float = Field(default=0.0, ge=0, le=16, allow_inf_nan=False)
+    sensor_photons: float = Field(default=0.0, ge=0, le=1e9, allow_inf_nan=False)
+    sensor_read_noise: float = Field(default=0.0, ge=0, le=1, allow_inf_nan=False)
+    sensor_noise_stops: float = Field(default=0.0, ge=0, le=16, allow_inf_nan=False)
+    sensor_mosaic: bool = False
+    sensor_sharp_noise: bool = False
 
     baselines: str = ""
 
@@ -81,6 +106,20 @@ class DatasetSpec(BaseModel):
         problem = assets_problem(self.source, self.assets)
         if problem:
             raise ValueError(problem)
+        return self
+
+    @model_validator(mode="after")
+    def _sensor_fits(self) -> DatasetSpec:
+        names = [n for n in type(self).model_fields if n.startswith("sensor_")]
+        if self.sensor != "gamma":
+            unread = names if self.sensor == "off" else ["sensor_gamma", "sensor_shoulder"]
+            changed = [n for n in unread if getattr(self, n) != type(self).model_fields[n].default]
+            if changed:
+                wanted = "gamma" if self.sensor == "srgb" else "srgb or gamma"
+                raise ValueError(f"sensor: expected {wanted} for {', '.join(changed)}, got {self.sensor!r}")
+        elif self.sensor_gamma + self.sensor_shoulder <= 0:
+            total = self.sensor_gamma + self.sensor_shoulder
+            raise ValueError(f"sensor_shoulder: expected sensor_gamma + sensor_shoulder above 0, got {total:g}")
         return self
 
     @property

@@ -1,6 +1,6 @@
 """Writer: a sample as one multi-part EXR and two PNGs, each there as a whole or not at all (the only door to OpenEXR).
 
-Before: samples.py.  After: manifest.py lists what is finished; dataset.py reads with `read_exr`.
+Before: samples.py.  After: manifest.py and shards.py list what is finished; dataset.py reads with `decode_exr`.
 Symbols: H, W image size. Parts of the EXR, ZIP-compressed, which carries a checksum:
 `sharp` R G B A and `blurred` R G B in half; `data` in float32 (ids in uint32); `coverage` one float32 channel a mesh;
 `baseline.NAME` R G B in half for each filter that was asked for.
@@ -13,9 +13,10 @@ import io
 import itertools
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
@@ -60,29 +61,50 @@ def write_frame(folder: str | Path, index: int, sample: Sample) -> dict[str, Any
     Source: ours.
     """
     paths = frame_paths(index)
-    contents = {
-        "exr": encode_exr(sample_parts(sample), sample.meta),
-        "sharp": encode_png(bytes_from_linear(sample.sharp[..., :3]).numpy()),
-        "blur": encode_png(bytes_from_linear(sample.blurred[..., :3]).numpy()),
-    }
     files = []
-    for kind, data in contents.items():
+    for kind, data in frame_contents(sample).items():
         write_atomically(Path(folder) / paths[kind], data)
-        files.append({"path": paths[kind], "sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)})
-    meta = sample.meta
+        files.append(list_file(paths[kind], data))
+    return frame_entry(index, sample, files)
+
+
+def frame_contents(sample: Sample) -> dict[str, bytes]:
+    """Return the bytes of a frame's files: `exr`, `sharp` and `blur`.
+
+    Raises:
+        ValueError: a colour beyond what half floats hold.
+
+    Source: ours.
+    """
+    images = {"sharp": sample.sharp, "blur": sample.blurred}
+    pictures = sample.pictures or {name: bytes_from_linear(image[..., :3]) for name, image in images.items()}
     return {
-        "index": index,
-        "clip": meta["clip"],
-        "frame": meta["frame"],
-        "config_sha256": meta["config_sha256"],
-        "effects": [name for name, effect in meta["plan"]["effects"].items() if effect["needed"]],
-        "files": files,
-    } | baselines_entry(tuple(sample.baselines))
+        "exr": encode_exr(sample_parts(sample), sample.meta),
+        "sharp": encode_png(pictures["sharp"].numpy()),
+        "blur": encode_png(pictures["blur"].numpy()),
+    }
+
+
+def list_file(path: str, data: bytes) -> dict[str, Any]:
+    """Return how a list names a file. Source: ours."""
+    return {"path": path, "sha256": hashlib.sha256(data).hexdigest(), "bytes": len(data)}
+
+
+def frame_notes(sample: Sample) -> dict[str, list[str]]:
+    """Return what a list says of a frame beside its files: the effects called for and its baselines. Source: ours."""
+    effects = [name for name, effect in sample.meta["plan"]["effects"].items() if effect["needed"]]
+    return {"effects": effects} | baselines_entry(tuple(sample.baselines))
 
 
 def baselines_entry(names: tuple[str, ...]) -> dict[str, list[str]]:
-    """Return what the manifest's entry of a frame says of its baselines: nothing if there are none. Source: ours."""
+    """Return what a list's entry of a frame says of its baselines: nothing if there are none. Source: ours."""
     return {"baselines": list(names)} if names else {}
+
+
+def frame_entry(index: int, sample: Sample, files: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return a list's entry for a frame. Source: ours."""
+    what = {name: sample.meta[name] for name in ("clip", "frame", "config_sha256")}
+    return {"index": index, **what, **frame_notes(sample), "files": files}
 
 
 def sample_parts(sample: Sample) -> dict[str, dict[str, np.ndarray]]:
@@ -141,12 +163,12 @@ def encode_exr(parts: Mapping[str, Mapping[str, np.ndarray]], meta: Mapping[str,
     return buffer.getvalue()
 
 
-def read_exr(path: str | Path, sha256: str | None = None) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, Any]]:
+def read_exr(path: str | Path) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, Any]]:
     """Return the parts and the metadata that `encode_exr` stored.
 
     Args:
         path: of the file.
-        sha256: what the manifest says of its bytes. Without it, damage to parts that did not shrink goes unnoticed.
+            Damage to parts that did not shrink goes unnoticed: only the lists of the data set tell of it.
 
     Raises:
         FrameFileError: the file is missing, cut short, damaged or not one of ours; it is named.
@@ -157,18 +179,31 @@ def read_exr(path: str | Path, sha256: str | None = None) -> tuple[dict[str, dic
         data = Path(path).read_bytes()
     except OSError as error:
         raise FrameFileError(f"{path}: expected a frame, got {type(error).__name__}: {error.strerror}") from None
-    if sha256 is not None and hashlib.sha256(data).hexdigest() != sha256:
-        raise FrameFileError(f"{path}: expected the bytes that the manifest lists, got a damaged file")
+    return decode_exr(data, str(path))
+
+
+def decode_exr(data: bytes, name: str) -> tuple[dict[str, dict[str, np.ndarray]], dict[str, Any]]:
+    """Return the parts and the metadata that `encode_exr` stored.
+
+    Args:
+        data: what it returned.
+        name: how an error calls it.
+
+    Raises:
+        FrameFileError: the bytes are cut short, damaged or not ours.
+
+    Source: ours.
+    """
     try:
         file = OpenEXR.File(io.BytesIO(data), separate_channels=True, num_threads=0)
         # A damaged file does not raise: it comes back with no parts.
         parts = {p.name(): {n: c.pixels for n, c in p.channels.items()} for p in file.parts}
         meta = json.loads(file.parts[0].header[META_NAME]) if file.parts else {}
     except (RuntimeError, ValueError, KeyError, TypeError) as error:
-        raise FrameFileError(f"{path}: expected a readable EXR frame, got {type(error).__name__}: {error}") from None
+        raise FrameFileError(f"{name}: expected a readable EXR frame, got {type(error).__name__}: {error}") from None
     missing = [name for name in ("sharp", "blurred", "data") if name not in parts]
     if missing or any(plane is None for channels in parts.values() for plane in channels.values()):
-        raise FrameFileError(f"{path}: expected parts sharp, blurred and data, got a damaged or foreign file")
+        raise FrameFileError(f"{name}: expected parts sharp, blurred and data, got a damaged or foreign file")
     return parts, meta
 
 
@@ -180,11 +215,24 @@ def write_atomically(path: str | Path, data: bytes) -> None:
 
     Source: ours.
     """
+    with atomic_file(path) as file:
+        file.write(data)
+
+
+@contextmanager
+def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
+    """Give a temporary file to write to, which gets its final name when the block ends without an exception.
+
+    Raises:
+        OSError: nothing was written under the final name, and the temporary file is gone.
+
+    Source: ours.
+    """
     path = Path(path)
     temporary = path.with_name(f"{TEMPORARY_PREFIX}{os.getpid()}-{next(_counter)}-{path.name}")
     try:
         with temporary.open("wb") as file:
-            file.write(data)
+            yield file
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)

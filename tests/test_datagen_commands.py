@@ -1,17 +1,20 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
-from test_datagen_runs import command
+from test_datagen_runs import ROOT, command
 
 import datagen.runs
-from datagen import BlurDataset, MeshError, generate, parse_spec
+from datagen import BlurDataset, DatasetSpec, MeshError, generate, parse_spec
 from datagen.__main__ import main
 from datagen.executors import MAX_TRIES, run_processes, run_serial
 from datagen.manifest import read_manifest
 from datagen.report import effect_shares
+from datagen.spec import read_spec_fields
 
 
 def task_that_fails_at_2(plan, folder, index):
@@ -45,6 +48,12 @@ def test_a_frame_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_
     assert len(list(tmp_path.iterdir())) == MAX_TRIES
     with pytest.raises(ValueError, match="workers: expected"):
         list(run_processes(task_that_dies_at_1, "", "", range(1), 0))
+
+
+def test_a_worker_watches_over_its_driver_before_it_imports_torch():
+    program = "import sys, datagen.executors, datagen.__main__; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
 
 
 def test_a_failing_frame_gives_exit_code_1_and_is_made_by_a_rerun(tmp_path, monkeypatch, capsys):
@@ -161,8 +170,97 @@ def test_a_sequence_is_played(tmp_path):
     out = tmp_path / "data"
     words = [*command(out, count=2, workers=1), "--source", "sequence", "--assets", str(tmp_path / "walk.npz")]
     assert main(words) == 0
-    from datagen import BlurDataset
-
     meta = BlurDataset(out).metadata(1)
     assert meta["scene"]["sequence"]["frames"] == 6
     assert meta["meshes"][-1]["segments"] >= 1
+
+
+def test_every_command_has_help_that_does_not_wait_for_torch():
+    program = (
+        "import sys, contextlib, io; from datagen.__main__ import main; from datagen.commands import COMMANDS\n"
+        "for words in ([], ['generate'], *([name] for name in COMMANDS)):\n"
+        "    with contextlib.redirect_stdout(io.StringIO()) as told:\n"
+        "        assert main([*words, '--help']) == 0\n"
+        "    assert 'usage' in told.getvalue().lower()\n"
+        "print([m for m in ('torch', 'numpy', 'trimesh', 'OpenEXR', 'kornia') if m in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_a_wrong_command_is_refused_and_the_right_ones_are_named(tmp_path, capsys):
+    assert main(["verfy", str(tmp_path)]) == 2
+    assert (
+        "command: expected one of generate, init, status, verify, retry, export, inspect, report"
+        in capsys.readouterr().err
+    )
+    assert main(["verify"]) == 2
+    for name in ("status", "verify", "retry"):
+        assert main([name, str(tmp_path / "nothing")]) == 2, name
+
+
+def test_init_writes_a_configuration_that_generate_reads(tmp_path, capsys):
+    assert main(["init"]) == 0
+    text = capsys.readouterr().out
+    place = tmp_path / "run.toml"
+    assert main(["init", "--out", str(place)]) == 0
+    assert place.read_text() == text
+    assert main(["init", "--out", str(place)]) == 2
+    assert place.read_text() == text
+    assert parse_spec(read_spec_fields(place)) == parse_spec({})
+    assert {line.removeprefix("# ").split(" = ")[0] for line in text.splitlines()} == set(DatasetSpec.model_fields)
+    words = command(tmp_path / "data", count=1, workers=1)
+    assert main(["generate", *words, "--config", str(place)]) == 0
+
+
+@pytest.mark.parametrize("storage", ["folder", "shards"])
+def test_a_data_set_from_its_failure_to_its_export(tmp_path, monkeypatch, capsys, storage):
+    real, out = datagen.runs.make_sample, tmp_path / "data"
+    monkeypatch.setattr(datagen.runs, "make_sample", lambda plan, i: 1 / 0 if i == 1 else real(plan, i))
+    assert main([*command(out, count=3, workers=1), "--storage", storage, "--frames-per-shard", "2"]) == 1
+    capsys.readouterr()
+    assert main(["status", str(out)]) == 1
+    told = capsys.readouterr()
+    assert told.out.startswith("2 of 3 frames finished, 1 failed")
+    assert told.err == "failed frame 1: ZeroDivisionError: division by zero\n"
+    assert main(["verify", str(out)]) == 0
+    assert main(["export", str(out), str(tmp_path / "gopro"), "gopro"]) == 2
+    assert "expected a finished data set of 3 frames, got 2 of them" in capsys.readouterr().err
+    monkeypatch.setattr(datagen.runs, "make_sample", real)
+    assert main(["retry", str(out)]) == 0
+    assert main(["status", str(out)]) == 0
+    capsys.readouterr()
+    assert main(["inspect", str(out), "--frame", "2"]) == 0
+    told = capsys.readouterr().out
+    assert f"{out}: frame 2, 8 x 6 px" in told
+    assert '"rays_per_pixel": 1' in told
+    assert main(["inspect", str(out)]) == 2
+    assert main(["inspect", str(out), "--frame", "3"]) == 2
+    assert main(["export", str(out), str(tmp_path / "gopro"), "gopro", "--split", "test"]) == 0
+    assert (tmp_path / "gopro/test/clip000001/blur/000000.png").is_file()
+    assert main(["export", str(out), str(tmp_path / "other"), "gropo"]) == 2
+    listed = {"folder": "frames/00000002.exr", "shards": "shards/000001.tar"}[storage]
+    data = bytearray((out / listed).read_bytes())
+    data[len(data) // 2] ^= 1
+    (out / listed).write_bytes(bytes(data))
+    capsys.readouterr()
+    assert main(["verify", str(out)]) == 3
+    assert listed in capsys.readouterr().err
+    assert main(["export", str(out), str(tmp_path / "lossy"), "gopro"]) == 3
+    assert main(["retry", str(out)]) == 0
+    assert main(["verify", str(out)]) == 0
+
+
+def test_inspect_tells_the_range_of_every_channel_of_a_file(tmp_path, capsys):
+    assert main(command(tmp_path / "data", count=1, workers=1)) == 0
+    capsys.readouterr()
+    assert main(["inspect", str(tmp_path / "data/frames/00000000.exr")]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {tuple(line.split()[:2]): line.split()[2:] for line in lines[2:] if line.split()[0] in ("data", "sharp")}
+    item = BlurDataset(tmp_path / "data")[0]
+    alpha = item["alpha"]
+    assert rows["data", "A"] == ["float32", f"{alpha.min():g}", f"{alpha.max():g}", "0"]
+    assert int(rows["data", "Z"][-1]) == int((~item["depth"].isfinite()).sum())
+    (tmp_path / "x.exr").write_bytes(b"junk")
+    assert main(["inspect", str(tmp_path / "x.exr")]) == 3
+    assert main(["inspect", str(tmp_path / "y.exr")]) == 3

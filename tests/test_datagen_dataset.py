@@ -8,7 +8,7 @@ import torch
 from PIL import Image
 from torch.utils.data import DataLoader
 
-from datagen import BlurDataset, FrameFileError, generate, parse_spec, verify_dataset
+from datagen import BlurDataset, generate, parse_spec
 from datagen.report import motion_colours
 
 
@@ -89,32 +89,6 @@ def test_what_is_missing_or_damaged_is_named(folder, tmp_path):
         BlurDataset(tmp_path)
     with pytest.raises(IndexError):
         BlurDataset(folder)[5]
-
-
-def test_one_flipped_bit_anywhere_is_found_and_named(folder):
-    assert verify_dataset(folder) == []
-    rng = np.random.default_rng(0)
-    files = sorted(p for d in ("frames", "sharp", "blur") for p in (folder / d).iterdir())
-    for _ in range(40):
-        path = files[int(rng.integers(len(files)))]
-        data = path.read_bytes()
-        broken = bytearray(data)
-        broken[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
-        path.write_bytes(bytes(broken))
-        problems = verify_dataset(folder)
-        assert len(problems) == 1
-        assert str(path) in problems[0]
-        if path.suffix == ".exr":
-            with pytest.raises(FrameFileError, match=path.name):
-                BlurDataset(folder)[int(path.stem)]
-        path.write_bytes(data)
-    path.unlink()
-    assert "got none" in verify_dataset(folder)[0]
-    if path.suffix == ".exr":
-        with pytest.raises(FrameFileError, match=path.name):
-            BlurDataset(folder)[int(path.stem)]
-    path.write_bytes(data)
-    assert verify_dataset(folder) == []
 
 
 def test_the_contact_sheet_shows_every_frame(folder):

@@ -1,3 +1,4 @@
+import functools
 import hashlib
 import json
 import os
@@ -14,6 +15,7 @@ import pytest
 import datagen.runs
 from datagen import ManifestError, SpecError, generate, parse_spec, verify_dataset
 from datagen.__main__ import main
+from datagen.entries import read_entries
 from datagen.manifest import MANIFEST_NAME, read_manifest
 from datagen.writer import FOLDERS, TEMPORARY_PREFIX
 
@@ -28,7 +30,9 @@ def spec(count=4, **fields):
 def sums(folder):
     """The checksum of everything a run leaves, by relative path."""
     files = [
-        p for p in sorted(Path(folder).rglob("*")) if p.is_file() and p.suffix in (".exr", ".png", ".jsonl", ".json")
+        p
+        for p in sorted(Path(folder).rglob("*"))
+        if p.is_file() and p.suffix in (".exr", ".png", ".jsonl", ".json", ".tar")
     ]
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
@@ -241,14 +245,14 @@ def test_a_manifest_of_another_configuration_is_refused_and_left_alone(reference
 
 # One process that forks for every kill point: the k-th fsync or rename kills it before, or after, being done.
 KILL_EVERYWHERE = """
-import os, signal, sys
+import os, shutil, signal, sys
 import torch
 torch.set_num_threads(1)
 import datagen.runs as runs
-from datagen import generate, parse_spec
+from datagen import generate, parse_spec, verify_dataset
 from datagen.samples import make_sample
 import json, pathlib
-base, fields = pathlib.Path(sys.argv[1]), json.loads(sys.argv[2])
+base, fields, begun = pathlib.Path(sys.argv[1]), json.loads(sys.argv[2]), int(sys.argv[3])
 spec = parse_spec(fields)
 made = {}
 def remembered(plan, index):  # rendering is not what is tested here
@@ -257,6 +261,8 @@ def remembered(plan, index):  # rendering is not what is tested here
     return made[index]
 runs.make_sample = remembered
 generate(spec, base / "whole")
+if begun:
+    generate(parse_spec(fields | {"count": begun}), base / "begun")
 
 def in_child(k, after, out):
     pid = os.fork()
@@ -286,14 +292,13 @@ while True:
     killed = 0
     for after in (False, True):
         out = base / f"{k}-{after}"
+        if begun:
+            shutil.copytree(base / "begun", out)
         status = in_child(k, after, out)
         if os.WIFSIGNALED(status):
             killed += 1
-            listed = [json.loads(l) for l in (out / "manifest.jsonl").read_bytes().split(b"\\n")[:-1]] \\
-                if (out / "manifest.jsonl").exists() else []
-            for entry in listed:  # a listed frame is whole, right after the kill
-                for file in entry["files"]:
-                    assert (out / file["path"]).stat().st_size == file["bytes"], (k, after)
+            if (out / "run.json").exists() and ((out / "manifest.jsonl").exists() or (out / "shards").exists()):
+                assert verify_dataset(out) == [], (k, after)  # what is listed is whole, right after the kill
         status = in_child(0, False, out)
         assert status == 0, (k, after, status)
     points += killed
@@ -303,14 +308,26 @@ print(points)
 """
 
 
+SHARDS = {"storage": "shards", "frames_per_shard": 2}
+
+
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
-def test_killed_at_every_commit_step_a_rerun_gives_the_same_bytes(tmp_path):
-    child = run_script(KILL_EVERYWHERE, tmp_path, json.dumps(TINY | {"count": 2}), stdout=subprocess.PIPE)
+@pytest.mark.parametrize(
+    ("fields", "begun", "fewest"),
+    [
+        ({"count": 2}, 0, 2 * 2 * 10),  # three files of three steps and a line, a frame
+        (SHARDS | {"count": 3}, 0, 2 * 2 * 6),  # two files of three steps, a shard
+        (SHARDS | {"count": 4}, 3, 2 * 8),  # a shard that grows: its marker goes before the tar is replaced
+    ],
+    ids=["folder", "shards", "growing shard"],
+)
+def test_killed_at_every_commit_step_a_rerun_gives_the_same_bytes(tmp_path, fields, begun, fewest):
+    child = run_script(KILL_EVERYWHERE, tmp_path, json.dumps(TINY | fields), begun, stdout=subprocess.PIPE)
     points = int(child.communicate(timeout=300)[0].splitlines()[-1])
     assert child.returncode == 0
-    assert points >= 2 * 2 * 10  # three files of three steps and a line, a frame
+    assert points >= fewest
     whole = sums(tmp_path / "whole")
-    runs = [p for p in tmp_path.iterdir() if p.name != "whole"]
+    runs = [p for p in tmp_path.iterdir() if p.name not in ("whole", "begun")]
     assert len(runs) == points + 2
     for folder in runs:
         assert sums(folder) == whole, folder.name
@@ -344,12 +361,19 @@ def children_of(pid):
 
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
-def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path):
-    generate(spec(count=6), tmp_path / "whole")
+@pytest.mark.parametrize("storage", ["folder", "shards"])
+def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path, storage):
+    fields = {"count": 6, "storage": storage, "frames_per_shard": 2}
+    generate(spec(**fields), tmp_path / "whole")
     folder, rng = tmp_path / "data", random.Random(3)
-    driver = run_script(DRIVE, *command(folder), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    words = [*command(folder), "--storage", storage, "--frames-per-shard", "2"]
+    driver = run_script(DRIVE, *words, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     deadline = time.monotonic() + 60
-    while not list((folder / "frames").glob("*.exr")) and time.monotonic() < deadline and driver.poll() is None:
+    while (
+        not [p for p in folder.rglob("0*.*") if p.suffix in (".exr", ".tar")]
+        and time.monotonic() < deadline
+        and driver.poll() is None
+    ):
         time.sleep(0.01)
     time.sleep(rng.uniform(0, 0.3))
     workers = children_of(driver.pid)
@@ -360,9 +384,9 @@ def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path):
         time.sleep(0.05)
     assert workers
     assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
-    listed = read_manifest(folder) if (folder / MANIFEST_NAME).exists() else {}
+    listed = read_entries(folder)
     assert verify_dataset(folder) == []
-    result = generate(spec(count=6), folder)
+    result = generate(spec(**fields), folder)
     assert result.kept == len(listed)
     assert sums(folder) == sums(tmp_path / "whole")
 
@@ -382,7 +406,7 @@ def test_an_interrupt_ends_with_130_and_a_rerun_finishes(tmp_path):
 
 def test_two_runs_in_one_folder_are_not_let_in(tmp_path):
     pytest.importorskip("fcntl", reason="needs the system's file locks")
-    from datagen.manifest import locked_folder
+    from datagen.folders import locked_folder
 
     with locked_folder(tmp_path / "data"), pytest.raises(SpecError, match="no other run"):
         generate(spec(), tmp_path / "data")
@@ -398,25 +422,39 @@ def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path):
     assert {p.name for p in tmp_path.rglob("*.*")} == {"letter.txt", ".tmp-1-1-mine", "own.exr", ".lock"}
 
 
-def test_a_full_disk_at_the_manifest_ends_with_1_and_a_rerun_finishes(reference, tmp_path, monkeypatch, capsys):
-    real, left = os.fsync, [9]
+@pytest.mark.parametrize("storage", ["folder", "shards"])
+def test_a_full_disk_at_any_write_loses_nothing_and_a_rerun_finishes(tmp_path, monkeypatch, capsys, storage):
+    fields = {"count": 3, "storage": storage, "frames_per_shard": 2}
+    sync = os.fsync
+    monkeypatch.setattr(datagen.runs, "make_sample", functools.cache(datagen.runs.make_sample))
+    generate(spec(**fields), tmp_path / "whole")
+    words = [*command("", count=3, workers=1)[2:], "--storage", storage, "--frames-per-shard", "2"]
+    left = [0]
 
     def full(descriptor):
         left[0] -= 1
         if left[0] == 0:
             raise OSError(28, "No space left on device")
-        return real(descriptor)
+        return sync(descriptor)
 
-    words = command(tmp_path / "data", count=4, workers=1)
-    for calls in (2, 9, 14, 21, 60):  # at the start, inside frames, at a manifest line, at the end
+    steps = codes = 0
+    while left[0] <= 0:  # until a run ends before the disk is full
+        steps += 1
+        left[0] = steps
+        out = tmp_path / f"{steps}"
         monkeypatch.setattr("os.fsync", full)
-        left[0] = calls
-        assert main(words) in (0, 1)
-        monkeypatch.setattr("os.fsync", real)
-        assert not list((tmp_path / "data").rglob(f"{TEMPORARY_PREFIX}*"))
-    assert main(words) == 0
-    assert sums(tmp_path / "data") == sums(reference)
-    assert "No space left" in capsys.readouterr().err
+        code = main(["--out", str(out), *words])
+        monkeypatch.setattr("os.fsync", sync)
+        assert code == (1 if left[0] <= 0 else 0), steps
+        assert not list(out.rglob(f"{TEMPORARY_PREFIX}*")), steps
+        if (out / "run.json").exists() and ((out / MANIFEST_NAME).exists() or (out / "shards").exists()):
+            assert verify_dataset(out) == [], steps
+        if code:
+            codes += 1
+            assert "No space left" in capsys.readouterr().err
+        assert main(["--out", str(out), *words]) == 0
+        assert sums(out) == sums(tmp_path / "whole"), steps
+    assert codes >= 10
 
 
 def test_a_path_that_is_a_file_is_refused(tmp_path):

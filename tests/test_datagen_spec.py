@@ -1,3 +1,4 @@
+import dataclasses
 import json
 import subprocess
 import sys
@@ -5,6 +6,7 @@ import sys
 import numpy as np
 import pytest
 
+from datagen.__main__ import NOT_IN_THE_SPEC, Arguments
 from datagen.seeds import open_stream
 from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields
 
@@ -70,20 +72,30 @@ def test_a_toml_file_gives_the_fields(tmp_path):
         read_spec_fields(path)
 
 
+def test_every_field_can_be_set_on_the_command_line():
+    flags = {field.name: field.default for field in dataclasses.fields(Arguments)}
+    assert set(flags) - set(NOT_IN_THE_SPEC) == set(DatasetSpec.model_fields)
+    assert all(flags[name] == field.default for name, field in DatasetSpec.model_fields.items())
+
+
 def test_a_specification_cannot_be_changed():
     spec = parse_spec({})
     with pytest.raises(Exception, match="frozen"):
         spec.width = 3
 
 
-def test_the_hash_leaves_out_count_and_the_place_of_assets_only(tmp_path):
+def test_the_hash_leaves_out_count_storage_and_the_place_of_assets_only(tmp_path):
     base = parse_spec({})
-    assert parse_spec({"count": 99}).config_sha256() == base.config_sha256()
     changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
                "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015"}  # fmt: skip
+    cameras = [{"sensor": "gamma"}, {"sensor": "gamma", "sensor_gain": 2.0}]
+    assert len({parse_spec(c).config_sha256() for c in (*cameras, {})}) == 3
     hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}
     assert len(hashes) == len(changed) + 1
-    assert set(changed) == set(DatasetSpec.model_fields) - {"count", "assets", "source"}
+    fields = {name for name in DatasetSpec.model_fields if not name.startswith("sensor")}
+    assert set(changed) == fields - {"source", "count", "assets", "storage", "frames_per_shard"}
+    for field in ({"count": 99}, {"storage": "shards"}, {"frames_per_shard": 7}):
+        assert parse_spec(field).config_sha256() == base.config_sha256()
     assert base.config_sha256("a") != base.config_sha256("b")
 
 

@@ -2,7 +2,7 @@
 
 from torchblur.accuracy import Accuracy
 from torchblur.camera import Camera
-from torchblur.effects import Effect, EffectPlan, plan_effects
+from torchblur.effects import EFFECTS, Effect, EffectPlan, plan_effects
 from torchblur.instant import Instant, motion_to, render_instant
 from torchblur.lights import DirectionalLight, PointLight, SpotLight
 from torchblur.material import Material
@@ -14,6 +14,7 @@ from torchblur.shutter import Shutter
 
 __version__ = "0.1.0"
 __all__ = [
+    "EFFECTS",
     "Accumulated",
     "Accuracy",
     "Camera",

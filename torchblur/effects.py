@@ -22,6 +22,9 @@ from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
 from torchblur.survey import Survey, shows_back, survey_prisms
 
+# what plans tell of, in their order
+EFFECTS = ("motion", "transparency", "texture", "lighting", "shadows", "clipping", "facing", "crossings", "curvature")
+EFFECTS += ("rays",)
 SWITCHED = ("motion", "transparency", "clipping", "facing", "crossings", "curvature")  # that rendering can leave out
 WIDTHS = (13, 8, 46, 46)  # characters of the printed columns
 

@@ -1,0 +1,234 @@
+"""Folders: who works in a data set's folder, and what it was asked to hold.
+
+Before: scenes.py, writer.py.  After: manifest.py, shards.py, runs.py.
+`run.json` holds the specification. Frames are stored in files of their own, listed in `manifest.jsonl` (manifest.py),
+or in tar files with a marker each (shards.py).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torchblur as tb
+from datagen.scenes import Plan
+from datagen.spec import NOT_IN_THE_BYTES, DatasetSpec, SpecError
+from datagen.writer import FOLDERS, TEMPORARY_PREFIX, write_atomically
+
+try:
+    import fcntl
+except ImportError:  # Windows has no such locks; two runs in one folder are then the user's to avoid
+    fcntl = None  # type: ignore[assignment]
+
+TEMPORARY_PATTERN = f"{TEMPORARY_PREFIX}[0-9]*-[0-9]*-*"
+RUN_NAME, LOCK_NAME, SHARD_FOLDER = "run.json", ".lock", "shards"
+SHARDS_FROM = 1000  # frames; below, `auto` means a file for each thing
+
+
+@dataclass(frozen=True)
+class Slice:
+    """A part of a run: of the shards 0, 1, … every one whose number leaves `number` - 1 when divided by `of`."""
+
+    number: int  # from 1
+    of: int
+
+    def holds(self, shard: int) -> bool:
+        """Tell whether a shard belongs to it."""
+        return shard % self.of == self.number - 1
+
+
+def parse_slice(text: str) -> Slice:
+    """Return the slice written as `3/100`, the third of a hundred.
+
+    Raises:
+        SpecError: another form, or a number that is not from 1 to the number of slices.
+
+    Example:
+        >>> parse_slice("3/100")
+        Slice(number=3, of=100)
+
+    Source: ours.
+    """
+    number, slash, of = text.partition("/")
+    is_valid = slash and all(part.isascii() and part.isdecimal() for part in (number, of))
+    if not is_valid or not 1 <= int(number) <= int(of):
+        raise SpecError([f"slice: expected i/n with i from 1 to n, got {text!r}"])
+    return Slice(int(number), int(of))
+
+
+@contextmanager
+def locked_folder(out: str | Path, part: Slice | None = None) -> Iterator[Path]:
+    """Create the folder if need be and hold it: one run at a time, or one run for each slice.
+
+    The system lets go when the process ends, however.
+
+    Raises:
+        SpecError: another run holds it, or the path is no folder.
+
+    Source: ours.
+    """
+    folder = Path(out)
+    names = [LOCK_NAME] if part is None else [LOCK_NAME, f"{LOCK_NAME}-{part.number}-of-{part.of}"]
+    held = []
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        held = [os.open(folder / name, os.O_RDWR | os.O_CREAT, 0o644) for name in names]
+    except OSError as error:
+        why = f"{type(error).__name__}: {error.strerror}"
+        raise SpecError([f"out: expected a folder that can be written, got {str(out)!r}: {why}"]) from None
+    try:
+        if fcntl is not None:
+            try:
+                for number, descriptor in enumerate(held):
+                    is_shared = part is not None and number == 0
+                    fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+            except OSError:
+                raise SpecError([f"out: expected a folder no other run works in, got {str(out)!r}"]) from None
+        yield folder
+    finally:
+        for descriptor in held:
+            os.close(descriptor)
+
+
+@contextmanager
+def one_at_a_time(folder: Path) -> Iterator[None]:
+    """Wait until no other slice begins in the folder, and keep the others waiting. Source: ours."""
+    descriptor = os.open(folder / f"{LOCK_NAME}-begin", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        if fcntl is not None:
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def settle_storage(spec: DatasetSpec, folder: Path) -> DatasetSpec:
+    """Return the specification with `auto` storage decided: what the folder has, else by the number of frames.
+
+    Raises:
+        SpecError: the folder's run.json cannot be read.
+
+    Source: ours.
+    """
+    if spec.storage != "auto":
+        return spec
+    storage = "shards" if spec.count >= SHARDS_FROM else "folder"
+    if (folder / RUN_NAME).exists():
+        storage = read_run(folder)["spec"].get("storage", "folder")
+    return spec.model_copy(update={"storage": storage})
+
+
+def check_run(folder: Path, plan: Plan) -> None:
+    """Raise unless a locked folder is empty or holds what `plan` makes, or less of it.
+
+    Raises:
+        SpecError: the folder holds data of another configuration; the fields that differ are named.
+
+    Source: ours.
+    """
+    if (folder / RUN_NAME).exists():
+        problems = _differences(read_run(folder), _run_record(plan), folder)
+        if problems:
+            raise SpecError(problems)
+        return
+    strange = sorted(p.name for p in folder.iterdir() if not _is_left_by_a_start(p))
+    if strange:  # people's own files are not to be mixed with, still less swept
+        found = ", ".join(strange[:3]) + (", …" if len(strange) > 3 else "")
+        raise SpecError([f"out: expected an empty folder or a data set with its {RUN_NAME}, got {found}"])
+
+
+def write_run(folder: Path, plan: Plan) -> None:
+    """Write `run.json`. Source: ours."""
+    write_atomically(folder / RUN_NAME, encode_run(_run_record(plan)))
+
+
+def read_run(folder: str | Path) -> dict[str, Any]:
+    """Return what `run.json` of a data set holds.
+
+    Raises:
+        SpecError: it is missing or damaged.
+
+    Source: ours.
+    """
+    path = Path(folder) / RUN_NAME
+    try:
+        record = json.loads(path.read_text(encoding="utf-8"))
+        if isinstance(record["spec"], dict):
+            return record
+    except FileNotFoundError:
+        raise SpecError([f"folder: expected a data set with its {RUN_NAME}, got none in {str(folder)!r}"]) from None
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        pass
+    raise SpecError([f"out: expected a readable {RUN_NAME}, got {str(path)!r} damaged"])
+
+
+def encode_run(record: dict[str, Any]) -> bytes:
+    """Return what `run.json` holds as its bytes. Source: ours."""
+    return (json.dumps(record, indent=1, sort_keys=True) + "\n").encode()
+
+
+def record_sum(record: dict[str, Any]) -> str:
+    """Return the checksum of all that a record holds but `record_sha256`, which is this checksum. Source: ours."""
+    fields = {name: value for name, value in record.items() if name != "record_sha256"}
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
+
+
+def sweep(places: Iterable[Path], names: Iterable[str] = ("*",)) -> None:
+    """Remove temporary files that killed runs left in some folders.
+
+    Args:
+        places: folders of a data set.
+        names: final names, as glob patterns, of what may be removed; by default all.
+
+    Source: ours.
+    """
+    for holder in places:
+        for name in names:
+            for stale in holder.glob(f"{TEMPORARY_PREFIX}[0-9]*-[0-9]*-{name}"):
+                stale.unlink(missing_ok=True)
+
+
+def _is_left_by_a_start(path: Path) -> bool:
+    """Tell whether a run that was killed before its run.json was there can have left this."""
+    if path.name in (*FOLDERS, SHARD_FOLDER):
+        return path.is_dir() and not any(path.iterdir())
+    return path.name == LOCK_NAME or path.name.startswith(f"{LOCK_NAME}-") or path.match(TEMPORARY_PATTERN)
+
+
+def _run_record(plan: Plan) -> dict[str, Any]:
+    """Return what run.json holds."""
+    record = {
+        "format": 1,
+        "spec": plan.spec.model_dump(),
+        "assets_sha256": plan.assets_sha256,
+        "asset_names": list(plan.asset_names),
+        "config_sha256": plan.config_sha256,
+        "torchblur_version": tb.__version__,
+    }
+    return record | {"record_sha256": record_sum(record)}
+
+
+def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) -> list[str]:
+    """Return one line for each field in which a folder's data differ from what is asked for."""
+    problems = []
+    was_spec, now_spec = {"storage": "folder"} | found["spec"], wanted["spec"]
+    fixed = set(was_spec) | set(now_spec)
+    fixed -= set(NOT_IN_THE_BYTES)
+    fixed |= {"storage"} | ({"frames_per_shard"} if now_spec["storage"] == was_spec["storage"] == "shards" else set())
+    for name in sorted(fixed):
+        was, now = was_spec.get(name), now_spec.get(name)
+        if was != now:
+            problems.append(f"{name}: expected {was!r} as in {folder}, got {now!r}")
+    if was_spec.get("count", 0) > now_spec["count"]:
+        had, asked = was_spec["count"], now_spec["count"]
+        problems.append(f"count: expected at least the {had} frames of {folder}, got {asked}")
+    for name in ("format", "assets_sha256", "torchblur_version"):
+        if found.get(name) != wanted[name] and not (name == "assets_sha256" and problems):
+            problems.append(f"{name}: expected {found.get(name)!r} as in {folder}, got {wanted[name]!r}")
+    return problems

@@ -1,0 +1,133 @@
+"""Longer versions of the tests of datagen's promises: what a kill at any time, or a changed bit, does to a data set.
+
+    python scripts/reliability.py --kills 50 --flips 1000
+
+Each round starts a run of two workers, kills the driver or a worker (SIGKILL) at a random time, looks at what is
+left, and starts the same command again; at the end every byte must be that of a run that was left alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import hashlib
+import os
+import random
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+from datagen import verify_dataset  # noqa: E402  after the path
+
+FIELDS = {
+    "count": 12,
+    "width": 16,
+    "height": 12,
+    "rays-per-pixel": 1,
+    "frames-per-clip": 2,
+    "frames-per-shard": 2,
+    "workers": 2,
+}
+
+
+def main() -> int:
+    """Run what is asked for and return 0 if every promise was kept."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=10, help="rounds for each way of storage and each victim")
+    parser.add_argument("--flips", type=int, default=1000, help="changed bits for each way of storage")
+    parser.add_argument("--seed", type=int, default=0)
+    chosen = parser.parse_args()
+    rng = random.Random(chosen.seed)
+    broken = 0
+    with tempfile.TemporaryDirectory() as name:
+        for storage in ("folder", "shards"):
+            whole = Path(name) / f"{storage}-whole"
+            start_s = time.monotonic()
+            assert start(whole, storage).wait() == 0
+            usual_s = time.monotonic() - start_s
+            for victim in ("driver", "worker"):
+                for _ in range(chosen.kills):
+                    delay_s = usual_s * rng.random()
+                    for problem in kill_and_finish(Path(name), storage, victim, delay_s):
+                        print(f"{storage}: {victim} killed after {delay_s:.2f} s: {problem}")
+                        broken += 1
+                print(f"{storage}: {victim} killed {chosen.kills} times, {broken} problems so far", flush=True)
+            missed = sum(not finds_a_flip(whole, rng) for _ in range(chosen.flips))
+            print(f"{storage}: {chosen.flips} bits changed, {missed} not found")
+            broken += missed
+    return min(broken, 1)
+
+
+def start(out: Path, storage: str) -> subprocess.Popen[bytes]:
+    """Start a run."""
+    flags = [word for name, value in FIELDS.items() for word in (f"--{name}", str(value))]
+    words = [sys.executable, "-m", "datagen", "--out", str(out), "--storage", storage, *flags]
+    return subprocess.Popen(words, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def kill_and_finish(base: Path, storage: str, victim: str, delay_s: float) -> list[str]:
+    """Kill a run once, finish it, and return in what it differs from what was promised."""
+    with tempfile.TemporaryDirectory(dir=base) as name:
+        out, problems = Path(name) / "data", []
+        run = start(out, storage)
+        time.sleep(delay_s)
+        workers = children_of(run.pid)
+        target = random.Random(delay_s).choice(workers) if victim == "worker" and workers else run.pid
+        with contextlib.suppress(ProcessLookupError):  # it may just have ended
+            os.kill(target, signal.SIGKILL)
+        run.wait(timeout=300)
+        if target == run.pid:
+            time.sleep(2)
+            alive = [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+            problems += [f"{len(alive)} processes alive 2 s later"] if alive else []
+            while any(Path(f"/proc/{pid}").exists() for pid in alive):
+                time.sleep(0.05)
+        if (out / "run.json").exists() and ((out / "manifest.jsonl").exists() or (out / "shards").exists()):
+            problems += verify_dataset(out)
+        code = start(out, storage).wait()
+        problems += [f"exit code {code}"] if code else []
+        found, wanted = sums(out), sums(base / f"{storage}-whole")
+        differing = sorted(key for key in {**found, **wanted} if found.get(key) != wanted.get(key))
+        return problems + [f"{key} differs" for key in differing]
+
+
+def children_of(pid: int) -> list[int]:
+    """Return the living processes whose parent is `pid`."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(fields[1]) == pid and fields[0] != "Z":
+            found.append(int(stat.parent.name))
+    return found
+
+
+def finds_a_flip(folder: Path, rng: random.Random) -> bool:
+    """Change one bit of what `verify` answers for, and tell whether it is found."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith((".lock", "contact_sheet"))]
+    path = rng.choice(files)
+    data = path.read_bytes()
+    changed = bytearray(data)
+    changed[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    path.write_bytes(bytes(changed))
+    is_found = verify_dataset(folder) != []
+    path.write_bytes(data)
+    return is_found
+
+
+def sums(folder: Path) -> dict[str, str]:
+    """Return the checksum of every file but the locks."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith(".lock")]
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -18,11 +18,16 @@ RTOL = 1e-5  # of the largest entry
 FLOAT64 = torch.float64
 POSITION, SIDE = (1.0, 2.0, 4.0), (-2.0, 0.5, 1.5)
 LIGHTS = {
-    "point": [tb.PointLight(POSITION, (30.0, 20.0, 10.0))],
-    "moving point": [tb.PointLight([POSITION, (1.5, 1.0, 3.0), (2.0, 2.5, 4.5)], 30.0)],
-    "directional": [tb.DirectionalLight((-0.3, -0.4, -1.0), (3.0, 2.0, 1.0))],
-    "spot": [tb.SpotLight(POSITION, (0.1, 0.0, 0.5), 60.0, inner_angle_deg=2.0, outer_angle_deg=25.0)],
-    "two": [tb.PointLight(POSITION, 30.0), tb.PointLight(SIDE, (5.0, 9.0, 1.0))],
+    "point": [tb.PointLight(POSITION, (30.0, 20.0, 10.0), casts_shadows=False)],
+    "moving point": [tb.PointLight([POSITION, (1.5, 1.0, 3.0), (2.0, 2.5, 4.5)], 30.0, casts_shadows=False)],
+    "directional": [tb.DirectionalLight((-0.3, -0.4, -1.0), (3.0, 2.0, 1.0), casts_shadows=False)],
+    "spot": [
+        tb.SpotLight(POSITION, (0.1, 0.0, 0.5), 60.0, inner_angle_deg=2.0, outer_angle_deg=25.0, casts_shadows=False)
+    ],
+    "two": [
+        tb.PointLight(POSITION, 30.0, casts_shadows=False),
+        tb.PointLight(SIDE, (5.0, 9.0, 1.0), casts_shadows=False),
+    ],
 }
 WALL = Body("wall", (0, 0, -3), "still", "flat", 1.0, True)
 SHUTTERS = {

@@ -30,9 +30,7 @@ from torch import Tensor
 
 from torchblur import bernstein, packed
 
-TOLERANCE = (
-    4e-7  # of a texture's contrast, of light on a facing surface; cut in two ways, they differ by less than 1e-6
-)
+TOLERANCE = 1e-6  # of what is looked at: the contrast of a texture between neighbours, the light on a facing surface
 RHO = (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 25.0, 50.0, 100.0, 300.0, 1e3, 1e4, 1e6, 1e8)
 LEVELS = 3.0  # what the share of a mip level grows by
 GROWTH = 20.0 * LEVELS  # S^2 (N V) / (|N| |V|^3), with N and V within a quarter of their middles and S within a half

@@ -116,7 +116,7 @@ class Scene:
     A face of shading "lambert" shows its colour times (ambient + sum of irradiance / pi * cosine) over the lights: with
     its own normal turned to the viewer, or with the mesh's vertex normals, negated where the eye sees the back of the
     face, from which its corners turn clockwise.
-    Faces of shading "unlit" ignore lights and ambient. Lights cast no shadows.
+    Faces of shading "unlit" ignore lights and ambient. All faces cast the shadows of lights that cast any.
 
     Args:
         meshes: any number of meshes, none too.

@@ -83,8 +83,8 @@ def render(
 
     Accuracy: geometry is solved in float64 whatever the type of the input; only the result is rounded to it.
     Gradient: to vertices, normals, camera, uv, colours, opacities, textures, lights, background. None comes from
-        silhouettes that do not move during the exposure (see README), nor from the edges of shadows. To vertices and camera only with
-        `Accuracy.exact()`.
+        silhouettes that do not move during the exposure (see README), nor from the edges of shadows. To vertices and
+        camera only with `Accuracy.exact()`.
     Source: Ronnow et al. 2021 and 2022; exactness, order and memory blocks: ours.
 
     Example:

@@ -68,9 +68,19 @@ def find_casters(scene: Scene) -> Casters | None:
         return None
     low, high = (find(world.movedim(2, 0).flatten(1), dim=1) for find in (torch.amin, torch.amax))
     extent = float(torch.cat([high - low, low.abs(), high.abs()]).max())
-    if all(_is_flat(world[..., t_open == t], BIAS * extent) for t in torch.unique(t_open)):
+    times = torch.unique(torch.cat([t_open, t_close])).tolist()
+    if all(_is_flat(_at(world, (t_open, t_close), ends), BIAS * extent) for ends in itertools.pairwise(times)):
         return None
     return Casters(world, t_open, t_close, face, 0.5 * (low + high), extent, moves)
+
+
+def _at(world: Tensor, slices: tuple[Tensor, Tensor], ends: tuple[float, float]) -> Tensor:
+    """Return (2, 3, 3, F) corners at both `ends` of a time in which none has a knot, of slices (open, close) (C,)."""
+    t_open, t_close = slices
+    own = ((t_open <= ends[0]) & (t_close >= ends[1])).nonzero().flatten()
+    first, last = world[..., own]
+    shares = ((t - t_open[own]) / (t_close - t_open)[own] for t in ends)
+    return torch.stack([(1 - u) * first + u * last for u in shares])
 
 
 def _is_flat(world: Tensor, slack: float) -> bool:

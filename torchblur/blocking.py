@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein
-from torchblur.casters import BIAS, Casters
+from torchblur.casters import Casters
 from torchblur.lights import DirectionalLight, Light, along
 from torchblur.sort import between
 
@@ -101,7 +101,7 @@ def when_blocked(
     Source: ours.
     """
     shared, share = _shared_time(receivers, casters, pairs)
-    found = _polynomials(light, shared, _corners(casters, pairs[1], shared), casters.extent)
+    found = _polynomials(light, shared, _corners(casters, pairs[1], shared), casters.gap)
     zero = torch.zeros_like(share[0])
     every = torch.arange(len(zero), device=zero.device)
     slices, parts = _Slices(every, zero, zero + 1, found.signs, found.noise), []
@@ -144,15 +144,17 @@ def _corners(casters: Casters, caster: Tensor, shared: Receivers) -> Tensor:
     return torch.stack([(1 - at) * first + at * last for at in u])
 
 
-def _polynomials(light: Light, shared: Receivers, corners: Tensor, extent: float) -> _Pairs:
+def _polynomials(light: Light, shared: Receivers, corners: Tensor, gap: float) -> _Pairs:
     """Return the polynomials of pairs whose corners are `corners` (2 or 1, 3, 3, n), see above."""
     ends = shared.t[: len(corners)]
+    point = shared.place.mean(0).abs().amax(0) / shared.scale.mean(0)
+    away = gap * torch.maximum(corners.abs().amax((0, 1, 2)), point)  # (n,) what a caster must be away at least
     if isinstance(light, DirectionalLight):
-        return _along_direction(torch.stack([along(light.direction, t) for t in ends]), shared, corners, extent)
-    return _from_position(torch.stack([along(light.position, t) for t in ends]), shared, corners, extent)
+        return _along_direction(torch.stack([along(light.direction, t) for t in ends]), shared, corners, away)
+    return _from_position(torch.stack([along(light.position, t) for t in ends]), shared, corners, away)
 
 
-def _from_position(position: Tensor, shared: Receivers, corners: Tensor, extent: float) -> _Pairs:
+def _from_position(position: Tensor, shared: Receivers, corners: Tensor, away: Tensor) -> _Pairs:
     """Return the polynomials of a light at `position` (2 or 1, 3, n)."""
     scale = shared.scale
     relative = corners - position.unsqueeze(1)
@@ -161,7 +163,7 @@ def _from_position(position: Tensor, shared: Receivers, corners: Tensor, extent:
     edges = bernstein.product(normals, vector.unsqueeze(1)).sum(2)
     volume = bernstein.product(normals[:, 1], relative[:, 0]).sum(1)
     distance = vector.mean(0).norm(dim=0) / scale.mean(0)
-    bias = (BIAS * extent / distance).clamp(max=1.0)  # infinite at the light
+    bias = (away / distance).clamp(max=1.0)  # infinite at the light
     nearer = (1 - bias) * edges.sum(1) - bernstein.product(scale, volume)
     size = relative.abs().amax((0, 2))
     reach = shared.place.abs().amax((0, 1)) + scale.amax(0) * position.abs().amax((0, 1))
@@ -173,7 +175,7 @@ def _from_position(position: Tensor, shared: Receivers, corners: Tensor, extent:
     return _Pairs(normals, torch.cat([edges, sides], dim=1), torch.cat([edge_noise, side_noise]))
 
 
-def _along_direction(direction: Tensor, shared: Receivers, corners: Tensor, extent: float) -> _Pairs:
+def _along_direction(direction: Tensor, shared: Receivers, corners: Tensor, away: Tensor) -> _Pairs:
     """Return the polynomials of a light that travels along `direction` (2 or 1, 3, n)."""
     place, scale = shared.place, shared.scale
     normals = torch.stack([_cross(direction, corners[:, j] - corners[:, i]) for i, j in EDGES], dim=1)
@@ -185,7 +187,7 @@ def _along_direction(direction: Tensor, shared: Receivers, corners: Tensor, exte
     height = place - bernstein.product(scale.unsqueeze(1), first)
     drop = bernstein.product(bernstein.product(area, direction).sum(1), scale)
     length = direction.mean(0).norm(dim=0)
-    bias = BIAS * extent / torch.where(length > 0, length, 1.0)
+    bias = away / torch.where(length > 0, length, 1.0)
     side = bernstein.product(area, height).sum(1) - bias * drop
     size, speed = corners.abs().amax((0, 2)), direction.abs().amax((0, 1))
     reach = place.abs().amax((0, 1))

@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchblur.scene import Scene
 
-BIAS = 1e-6  # of the casters' extent: a caster nearer than this to a point does not block it; float32 is that coarse
+# what vertices are known to, as a share of their coordinates: a caster nearer than this to a point does not block it
+GAP = {torch.float32: 1e-6, torch.float64: 1e-11}
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,7 @@ class Casters:
     centre: Tensor  # (3,) of the box around all casters: what is far from the origin is looked at from there
     extent: float  # the largest side of that box, or distance of the box from the origin: the size of rounding
     moves: bool  # whether one of them does
+    gap: float  # share of coordinates that a caster must be away from what it blocks
 
     @property
     def count(self) -> int:
@@ -68,10 +70,11 @@ def find_casters(scene: Scene) -> Casters | None:
         return None
     low, high = (find(world.movedim(2, 0).flatten(1), dim=1) for find in (torch.amin, torch.amax))
     extent = float(torch.cat([high - low, low.abs(), high.abs()]).max())
+    gap = max(GAP[mesh.vertices.dtype] for mesh in scene.meshes)
     times = torch.unique(torch.cat([t_open, t_close])).tolist()
-    if all(_is_flat(_at(world, (t_open, t_close), ends), BIAS * extent) for ends in itertools.pairwise(times)):
+    if all(_is_flat(_at(world, (t_open, t_close), ends), gap * extent) for ends in itertools.pairwise(times)):
         return None
-    return Casters(world, t_open, t_close, face, 0.5 * (low + high), extent, moves)
+    return Casters(world, t_open, t_close, face, 0.5 * (low + high), extent, moves, gap)
 
 
 def _at(world: Tensor, slices: tuple[Tensor, Tensor], ends: tuple[float, float]) -> Tensor:

@@ -121,7 +121,7 @@ def find_shadows(surfaces: Surfaces, receivers: Receivers, is_due: tuple[Tensor,
         is_due: light by light (K,) bool, whether the light is due at all: not where the surface faces away throughout.
 
     Accuracy: times are exact; what passes a texture's opacity is sampled TEXTURED_SLICES times, not certified. A caster
-        nearer to a point than casters.BIAS of the casters' extent does not block it.
+        nearer to a point than casters.GAP of its coordinates does not block it.
     Source: ours.
     """
     found, n_pairs = [], 0

@@ -54,6 +54,9 @@ class Arguments:
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
     """Frames per second at which a sequence is played."""
+    lighting: Literal["painted", "lamps", "mixed"] = "painted"
+    """A fixed light painted into the colours; lamps that move and cast shadows, which take longer; or one or the other,
+    clip by clip."""
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""

@@ -18,7 +18,7 @@ from typing import Any
 
 import torchblur as tb
 from datagen.scenes import Plan
-from datagen.spec import NOT_IN_THE_BYTES, DatasetSpec, SpecError
+from datagen.spec import ADDED_LATER, NOT_IN_THE_BYTES, DatasetSpec, SpecError
 from datagen.writer import FOLDERS, TEMPORARY_PREFIX, write_atomically
 
 try:
@@ -217,7 +217,8 @@ def _run_record(plan: Plan) -> dict[str, Any]:
 def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) -> list[str]:
     """Return one line for each field in which a folder's data differ from what is asked for."""
     problems = []
-    was_spec, now_spec = {"storage": "folder"} | found["spec"], wanted["spec"]
+    as_before = {"storage": "folder"} | {name: DatasetSpec.model_fields[name].default for name in ADDED_LATER}
+    was_spec, now_spec = as_before | found["spec"], wanted["spec"]
     fixed = set(was_spec) | set(now_spec)
     fixed -= set(NOT_IN_THE_BYTES)
     fixed |= {"storage"} | ({"frames_per_shard"} if now_spec["storage"] == was_spec["storage"] == "shards" else set())

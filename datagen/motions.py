@@ -177,6 +177,15 @@ class CameraPath:
         return camera.world_to_clip[: len(times)]
 
 
+def px_per_unit(camera: CameraPath, height: int) -> float:
+    """Return the screen size [px] of a scene unit at the camera's target at time 0, for an image `height` high [px].
+
+    Source: the pinhole camera.
+    """
+    distance = math.dist(camera.eye.at(torch.zeros(1))[0].tolist(), camera.target.at(torch.zeros(1))[0].tolist())
+    return height / (2 * distance * math.tan(math.radians(camera.fov_y_deg) / 2))
+
+
 def turns(axis: Vector, angles_rad: Tensor) -> Tensor:
     """Return (N, 3, 3) float64 rotations about `axis` (any length but 0) by angles (N,) [rad], right-handed.
 

@@ -26,7 +26,7 @@ from datagen.dataset import BlurDataset
 from datagen.entries import read_entries
 from datagen.listed_files import read_listed_file
 from datagen.pictures import decode_png, encode_png, shrink
-from datagen.report import motion_colours
+from datagen.report import grey_picture, motion_colours
 from datagen.writer import frame_paths, write_atomically
 
 LOOKED_AT, SHOWN, WORST, LISTED = 200, 8, 4, 100
@@ -82,7 +82,7 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
     """
     status = read_status(folder)
     entries = read_entries(folder)
-    dataset = BlurDataset(folder, keys=("motion", "depth"))
+    dataset = BlurDataset(folder, keys=("motion", "depth", "shadow"))
     looks = [look_at_frame(dataset, item) for item in _evenly(len(dataset), LOOKED_AT)]
     worst = sorted(looks, key=lambda look: (-look.blur_px, look.index))[:WORST]
     parts = [
@@ -91,7 +91,8 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
         _failures(status),
         f"<h2>Distributions</h2><p>Of {len(looks)} frames, evenly chosen from {len(dataset)}.</p>",
         _charts(looks),
-        "<h2>Samples</h2><p>Left of the slider sharp, right of it blurred; beside it the motion over the exposure.</p>",
+        "<h2>Samples</h2><p>Left of the slider sharp, right of it blurred; beside it the motion over "
+        "the exposure, and where there are lamps, the share of their light that no shadow takes away.</p>",
         *(_figure(dataset, looks[k], entries[looks[k].index]) for k in _evenly(len(looks), SHOWN)),
         "<h2>Longest blur</h2>",
         *(_figure(dataset, look, entries[look.index]) for look in worst),
@@ -183,15 +184,18 @@ def _chart(title: str, rows: Sequence[tuple[str, int]]) -> str:
 
 
 def _figure(dataset: BlurDataset, look: Look, entry: dict[str, Any]) -> str:
-    """Return one frame: sharp and blurred under a slider, and its motion."""
+    """Return one frame: sharp and blurred under a slider, its motion, and the shadows that fall if any."""
     files = [read_listed_file(dataset.folder, entry, frame_paths(look.index)[kind]) for kind in ("sharp", "blur")]
     sharp, blur = (_small(decode_png(data)) for data in files)
-    motion = _small(motion_colours(dataset[look.item]["motion"].permute(1, 2, 0)))
+    planes = dataset[look.item]
+    motion = _small(motion_colours(planes["motion"].permute(1, 2, 0)))
+    shadow = _small(grey_picture(planes["shadow"][0].clamp(0, 1))) if "shadows" in look.effects else None
     name, effects = f"frame {look.index}", escape(", ".join(look.effects))
     return (
         f'<figure><span class="pair">{_image(sharp, f"{name}, sharp")}{_image(blur, f"{name}, blurred", "over")}'
         f'<input type="range" min="0" max="100" value="50" aria-label="{name}"></span> '
         + _image(motion, f"{name}, motion")
+        + (_image(shadow, f"{name}, shadow") if shadow is not None else "")
         + f"<figcaption>{name}: blur up to {look.blur_px:.1f} px; {effects}</figcaption></figure>"
     )
 

@@ -1,6 +1,6 @@
 """Scenes: from the specification and a clip's number to the clip.
 
-Before: spec.py, assets.py, stages.py, casts.py.  After: samples.py.
+Before: spec.py, assets.py, stages.py, lit_stages.py, casts.py.  After: samples.py.
 Clip number c depends on (seed, c) and the assets, never on other clips.
 """
 
@@ -18,8 +18,9 @@ from torch import Tensor
 from datagen.assets import Roster, load_mesh, survey_meshes
 from datagen.casts import build_cast, choose_motion, choose_places
 from datagen.clips import Actor, Clip
+from datagen.lit_stages import choose_lit_stage, is_clip_lit
 from datagen.motions import PlayedVertices, RigidBody, turns
-from datagen.patterns import light, paint, palette_colours
+from datagen.patterns import lit_color, paint, palette_colours
 from datagen.seeds import open_stream
 from datagen.sequences import load_sequence, survey_sequence
 from datagen.shapes import Shape
@@ -85,20 +86,24 @@ def build_clip(plan: Plan, clip: int) -> Clip:
     }
     number = int(rngs["stage"].integers(0, 2**31))
     colours = palette_colours(number)
-    stage = choose_stage((rngs["camera"], rngs["backdrop"]), colours, (spec.width, spec.height))
-    aspect = spec.width / spec.height
-    notes: dict[str, object] = {"source": spec.source, **stage.kinds}
+    size, is_lit = (spec.width, spec.height), is_clip_lit(spec.lighting, spec.seed, clip)
+    notes: dict[str, object] = {"source": spec.source}
     if spec.source == "primitives":
-        cast = build_cast((rngs["cast"], rngs["motion"], rngs["colour"]), colours, aspect)
+        cast = build_cast((rngs["cast"], rngs["motion"], rngs["colour"]), colours, size[0] / size[1], is_lit)
     elif spec.source == "meshes":
-        cast = _mesh_cast(plan, rngs, colours, notes)
+        cast = _mesh_cast(plan, rngs, colours, notes, is_lit)
     else:
-        cast = [_sequence_actor(plan, rngs, colours, notes)]
-    return Clip((*stage.actors, *cast), stage.camera, stage.background, notes)
+        cast = [_sequence_actor(plan, rngs, colours, notes, is_lit)]
+    if is_lit:
+        stage = choose_lit_stage((rngs["camera"], open_stream(spec.seed, "lamps", clip)), colours, size, cast)
+    else:
+        stage = choose_stage((rngs["camera"], rngs["backdrop"]), colours, size)
+    notes |= stage.kinds
+    return Clip((*stage.actors, *cast), stage.camera, stage.background, notes, stage.lamps, stage.ambient)
 
 
 def _mesh_cast(
-    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object]
+    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object], is_lit: bool
 ) -> list[Actor]:
     """Return one to three of people's meshes, each with a rigid motion."""
     rng, spec = rngs["cast"], plan.spec
@@ -113,9 +118,9 @@ def _mesh_cast(
         shape = Shape(asset.vertices * size, asset.faces, _flat_uv(asset.vertices, asset.faces), False)
         place = tuple(0.35 * c for c in places[0]) if n == 1 else tuple(0.8 * c for c in places[k])
         body = RigidBody(shape.vertices, choose_motion(rngs["motion"], place, size))
-        color = _asset_color(shape, asset.color, colours, rngs["colour"])
+        color = _asset_color(shape, asset.color, colours, rngs["colour"], is_lit)
         opacity: Tensor | float = 1.0 if asset.opacity is None else asset.opacity.to(torch.float32)
-        actors.append(Actor(f"{name}-{k}", shape.faces, color, body, opacity))
+        actors.append(Actor(f"{name}-{k}", shape.faces, color, body, opacity, is_lit=is_lit))
         not_used += [f"{name}: {note}" for note in asset.notes]
     notes["assets"] = sorted({a.name.rsplit("-", 1)[0] for a in actors})
     if not_used:
@@ -124,7 +129,7 @@ def _mesh_cast(
 
 
 def _sequence_actor(
-    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object]
+    plan: Plan, rngs: dict[str, np.random.Generator], colours: Tensor, notes: dict[str, object], is_lit: bool
 ) -> Actor:
     """Return the sequence as one body: turned about the vertical and started somewhere, by the clip."""
     rng, spec = rngs["cast"], plan.spec
@@ -135,7 +140,7 @@ def _sequence_actor(
     length_s = max(len(positions) - 1, 0) / spec.sequence_fps
     start_s = float(rng.uniform(0, 2 * length_s))
     shape = Shape(positions[0], asset.faces, _flat_uv(positions[0], asset.faces), False)
-    color = _asset_color(shape, asset.color, colours, rngs["colour"])
+    color = _asset_color(shape, asset.color, colours, rngs["colour"], is_lit)
     notes["sequence"] = {
         "file": asset.name,
         "frames": len(positions),
@@ -145,15 +150,16 @@ def _sequence_actor(
     }
     if asset.notes:
         notes["not_used"] = list(asset.notes)
-    return Actor(asset.name, asset.faces, color, PlayedVertices(positions, spec.sequence_fps, start_s))
+    motion = PlayedVertices(positions, spec.sequence_fps, start_s)
+    return Actor(asset.name, asset.faces, color, motion, is_lit=is_lit)
 
 
-def _asset_color(shape: Shape, given: Tensor | None, colours: Tensor, rng: np.random.Generator) -> Tensor:
-    """Return face colours in painted light: the file's own, or two of the palette where it has none."""
+def _asset_color(shape: Shape, given: Tensor | None, colours: Tensor, rng: np.random.Generator, is_lit: bool) -> Tensor:
+    """Return face colours, with painted light unless lit: the file's own, or two of the palette where it has none."""
     own = colours[torch.from_numpy(rng.permutation(len(colours) - 1) + 1)]
     pattern = str(rng.choice(("plain", "gradient", "noise"), p=(0.4, 0.35, 0.25)))
     painted = paint(shape, own, pattern, rng)
-    return light(shape, painted if given is None else given, two_sided=True).to(torch.float32)
+    return lit_color(shape, painted if given is None else given, is_lit, two_sided=True)
 
 
 def _flat_uv(vertices: Tensor, faces: Tensor) -> Tensor:

@@ -114,7 +114,7 @@ def look_at_frame(dataset: BlurDataset, item: int) -> Look:
     depth = frame["depth"].double().numpy()
     depth = depth[np.isfinite(depth) & (depth > 0)]
     effects = tuple(name for name, e in meta.get("plan", {}).get("effects", {}).items() if e["simulated"])
-    knots = [*meta["meshes"], meta["camera"]]
+    knots = [*meta["meshes"], meta["camera"], *meta.get("lamps", ())]
     return Look(
         item=item,
         index=int(frame["index"]),

@@ -30,6 +30,7 @@ MAX_ROWS = 12
 MAX_CELL_PX = 256
 GAP_PX = 6
 TITLE_PX = 18
+LETTER_PX = 6  # width of a letter of the labels, about
 PAPER = 245  # grey of the sheet
 
 
@@ -61,9 +62,10 @@ def write_contact_sheet(folder: str | Path) -> Path:
         kinds = " ".join(str(v) for k, v in sorted(meta["scene"].items()) if isinstance(v, str))
         texts = {"sharp": f"{frame['index']}", "blurred": kinds, "motion": f"up to {fastest:.1f} px"}
         texts |= {"depth": "near is bright", "alpha": "white is opaque"}
-        texts |= {"shadow": "white is unblocked"} if shadow else {}
+        texts |= {"shadow": "white: no shadow"} if shadow else {}
         places = {name: GAP_PX + k * (size[0] + GAP_PX) for k, name in enumerate(columns)}
-        labels += [(places[name], top + size[1] + 2, text) for name, text in texts.items()]
+        fits = size[0] // LETTER_PX  # a longer text would run into the next one
+        labels += [(places[name], top + size[1] + 2, text[:fits]) for name, text in texts.items()]
         top += size[1] + TITLE_PX
     labels += [(x, 3, name.removeprefix(BASELINE)) for name, x in places.items()]
     sheet = np.full((top + 2, rows[0].shape[1], 3), PAPER, np.uint8)

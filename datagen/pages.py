@@ -1,6 +1,6 @@
 """Page: a data set's report as one HTML file that needs nothing else and loads nothing.
 
-Before: checks.py, dataset.py, report.py, pictures.py.  After: commands.py.
+Before: checks.py, dataset.py, report.py, pictures.py, run_log.py.  After: commands.py.
 Its content policy lets only this file's own style and script run, by their checksums; every text is escaped.
 Large data sets are told of by LOOKED_AT frames, evenly chosen, which the page says.
 """
@@ -15,6 +15,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,10 @@ from datagen.entries import read_entries
 from datagen.listed_files import read_listed_file
 from datagen.pictures import decode_png, encode_png, shrink
 from datagen.report import grey_picture, motion_colours
+from datagen.run_log import read_log
 from datagen.writer import frame_paths, write_atomically
 
-LOOKED_AT, SHOWN, WORST, LISTED = 200, 8, 4, 100
+LOOKED_AT, SHOWN, WORST, LISTED, RUNS_SHOWN = 200, 8, 4, 100, 12
 PICTURE_PX = 360
 BLUR_EDGES_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, math.inf)
 STYLE = """
@@ -88,6 +90,7 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
     parts = [
         f"<h1>{escape(str(Path(folder).resolve().name))}</h1>",
         _counts(status),
+        _throughput(folder),
         _failures(status),
         f"<h2>Distributions</h2><p>Of {len(looks)} frames, evenly chosen from {len(dataset)}.</p>",
         _charts(looks),
@@ -144,6 +147,23 @@ def _counts(status: Status) -> str:
     return (
         "<table>" + "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in rows.items()) + "</table>"
     )
+
+
+def _throughput(folder: str | Path) -> str:
+    """Return how fast the runs made frames, the last RUNS_SHOWN of them as a table, or nothing if none is known."""
+    notes, unread = read_log(folder)
+    lines = []
+    for note in notes[-RUNS_SHOWN:]:
+        when = datetime.fromtimestamp(note.started_s, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+        cells = (when, note.part or "all", note.workers, note.made, note.failed, f"{note.seconds:.1f}")
+        cells = (*cells, f"{note.pairs_per_s:.3g}")
+        lines.append("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in cells) + "</tr>")
+    heads = ("started", "slice", "workers", "pairs made", "failed", "seconds", "pairs per second")
+    table = f"<table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{''.join(lines)}</table>"
+    made, seconds = sum(note.made for note in notes), sum(note.seconds for note in notes)
+    told = f"{made} pairs in {seconds:.1f} s of {len(notes)} runs; runs that were killed are not in it."
+    bad = f"<p class='bad'>{unread} lines of the log of runs cannot be read.</p>" if unread else ""
+    return (f"<h2>Throughput</h2><p>{told}</p>{table}" if notes else "") + bad
 
 
 def _failures(status: Status) -> str:

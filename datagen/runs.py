@@ -1,6 +1,7 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py.  After: commands.py.
+Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py, run_log.py.
+After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
 
@@ -16,6 +17,7 @@ from datagen.folders import Slice, locked_folder, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.report import effect_shares, write_contact_sheet
+from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
 from datagen.scenes import Plan, plan_from_json, survey_assets
 from datagen.sensor import photograph
@@ -74,7 +76,8 @@ def generate(
         raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
     roster = survey_assets(spec)
     plan = Plan(spec, roster.names, roster.sha256)
-    with locked_folder(out, part) as folder:
+    part_text = f"{part.number}/{part.of}" if part else ""
+    with locked_folder(out, part) as folder, logged_run(folder, max(workers, 1), part_text) as note:
         run = _begin(folder, plan, part)
         entries, kept = run.holdings.entries, len(run.holdings.entries)
         repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
@@ -92,6 +95,7 @@ def generate(
             for outcome in outcomes:
                 made, lost = _frames_of(outcome, run)
                 failed += lost
+                note.made, note.failed = note.made + len(made), note.failed + len(lost)
                 for index, reason in lost:
                     progress.say(f"failed frame {index}: {reason}")
                     progress.step(is_done=False)

@@ -57,6 +57,10 @@ class Arguments:
     lighting: Literal["painted", "lamps", "mixed"] = "painted"
     """A fixed light painted into the colours; lamps that move and cast shadows, which take longer; or one or the other,
     clip by clip."""
+    textures: str | None = None
+    """Folder of pictures (PNG, JPEG, WebP, BMP) that floors, walls and half of the bodies wear."""
+    backgrounds: str | None = None
+    """Folder of pictures of which one is behind each clip, instead of walls and skies."""
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""

@@ -76,7 +76,7 @@ def survey_meshes(folder: str | Path) -> Roster:
     Source: ours.
     """
     names, refused, digest = [], [], hashlib.sha256()
-    for name in _files_under(folder):
+    for name in files_under(folder):
         suffix = Path(name).suffix.lower()
         if suffix in UNREAD_SUFFIXES:
             refused.append((name, f"expected one of {', '.join(MESH_SUFFIXES)}, got a {suffix} file"))
@@ -124,8 +124,11 @@ def file_state(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def _files_under(folder: str | Path) -> list[str]:
-    """Return the relative paths of all files under a folder, sorted; links to folders are not followed."""
+def files_under(folder: str | Path) -> list[str]:
+    """Return the relative paths of all files under a folder, sorted; links to folders are not followed.
+
+    Source: ours.
+    """
     found = []
     for root, _, files in os.walk(folder, followlinks=False):
         found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]

@@ -28,6 +28,8 @@ class Actor:
     motion: Moving
     opacity: Tensor | float = 1.0  # or (F,)
     double_sided: bool = True
+    texture: Tensor | None = None  # (h, w, 3) linear, which multiplies the colour
+    uv: Tensor | None = None  # (F, 3, 2), with a texture
     is_lit: bool = False  # by lamps and ambient light; otherwise its colour is what is seen
 
 
@@ -115,9 +117,15 @@ def freeze(clip: Clip, width: int, height: int, time_s: float) -> tb.Scene:
 
 def _mesh(actor: Actor, vertices: Tensor) -> tb.Mesh:
     """Return the actor as torchblur's mesh, vertices in float32: 1e-7 of the scene is far below a pixel."""
-    looks = {"double_sided": actor.double_sided, "shading": "lambert" if actor.is_lit else "unlit"}
-    material = tb.Material(color=actor.color, opacity=actor.opacity, **looks)
-    return tb.Mesh(vertices.to(torch.float32).contiguous(), actor.faces, material=material, name=actor.name)
+    material = tb.Material(
+        color=actor.color,
+        opacity=actor.opacity,
+        double_sided=actor.double_sided,
+        texture=actor.texture,
+        shading="lambert" if actor.is_lit else "unlit",
+    )
+    places = vertices.to(torch.float32).contiguous()
+    return tb.Mesh(places, actor.faces, material=material, uv=actor.uv, name=actor.name)
 
 
 def knot_times(segments: int, open_s: float, close_s: float) -> Tensor:

@@ -208,6 +208,8 @@ def _run_record(plan: Plan) -> dict[str, Any]:
         "spec": plan.spec.model_dump(),
         "assets_sha256": plan.assets_sha256,
         "asset_names": list(plan.asset_names),
+        "texture_names": list(plan.texture_names),
+        "background_names": list(plan.background_names),
         "config_sha256": plan.config_sha256,
         "torchblur_version": tb.__version__,
     }
@@ -225,6 +227,10 @@ def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) ->
     for name in sorted(fixed):
         was, now = was_spec.get(name), now_spec.get(name)
         if was != now:
+            problems.append(f"{name}: expected {was!r} as in {folder}, got {now!r}")
+    for name in ("textures", "backgrounds"):
+        was, now = was_spec.get(name), now_spec[name]
+        if (was is None) != (now is None):
             problems.append(f"{name}: expected {was!r} as in {folder}, got {now!r}")
     if was_spec.get("count", 0) > now_spec["count"]:
         had, asked = was_spec["count"], now_spec["count"]

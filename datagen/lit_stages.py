@@ -45,6 +45,7 @@ def choose_lit_stage(
     colours: Tensor,
     size: tuple[int, int],
     cast: Sequence[Actor],
+    is_open: bool = False,
 ) -> Stage:
     """Return camera, floor or walls, and lamps.
 
@@ -53,12 +54,14 @@ def choose_lit_stage(
         colours: (5, 3) palette, the backdrop's colour first.
         size: width and height of the image [px].
         cast: who moves above the floor.
+        is_open: the background must be in view: a floor and no walls.
 
     Source: ours.
     """
     camera_rng, rng = rngs
     rng.random()  # whether the clip is lit, see `is_clip_lit`
     kind = str(rng.choice(PLACES, p=PLACE_WEIGHTS))
+    kind = "floor" if is_open else kind
     camera, camera_kind = choose_camera(camera_rng, size[0] / size[1], PITCH_RAD[kind])
     main, second = backdrop_colours(rng, colours)
     main, second = (0.12 + 0.88 * c for c in (main, second))  # on black no shadow is seen

@@ -90,6 +90,10 @@ class RigidBody:
         """Return (N, V, 3) float64 world positions at times (N,) [s]. Source: ours."""
         return self.motion.place(self.vertices, times_s)
 
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices before any motion."""
+        return self.vertices
+
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times inside the window at which the velocity jumps: none."""
         return []
@@ -119,6 +123,10 @@ class PlayedVertices:
         share = (place - first)[:, None, None]
         index = first.long()
         return self.positions[index] * (1 - share) + self.positions[index + 1] * share
+
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices of the first frame."""
+        return self.positions[0]
 
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""

@@ -19,7 +19,7 @@ from datagen.progress import Progress
 from datagen.report import effect_shares, write_contact_sheet
 from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
-from datagen.scenes import Plan, plan_from_json, survey_assets
+from datagen.scenes import Plan, plan_from_json, survey_plan
 from datagen.sensor import photograph
 from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
 from datagen.spec import DatasetSpec, SpecError
@@ -74,8 +74,7 @@ def generate(
     spec = settle_storage(spec, Path(out))
     if part is not None and spec.storage != "shards":
         raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
-    roster = survey_assets(spec)
-    plan = Plan(spec, roster.names, roster.sha256)
+    plan, refused = survey_plan(spec)
     part_text = f"{part.number}/{part.of}" if part else ""
     with locked_folder(out, part) as folder, logged_run(folder, max(workers, 1), part_text) as note:
         run = _begin(folder, plan, part)
@@ -83,8 +82,8 @@ def generate(
         repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
         failed = []
         with Progress(run.total, kept, is_quiet) as progress:
-            if roster.refused:
-                progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
+            if refused:
+                progress.say(f"{len(refused)} asset files refused, listed at the end")
             for line in repaired:
                 progress.say(line)
             text = plan.to_json()
@@ -111,10 +110,10 @@ def generate(
         if run.task is make_frame:
             write_manifest(folder, entries)
         failed.sort()
-        _write_failures(folder, failed, list(roster.refused), part)
+        _write_failures(folder, failed, list(refused), part)
         sheet = write_contact_sheet(folder) if entries and part is None else None
     made_count, shares = len(entries) - kept, effect_shares(entries.values())
-    return RunResult(folder, made_count, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
+    return RunResult(folder, made_count, kept, tuple(failed), refused, sheet, tuple(repaired), shares)
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:

@@ -1,14 +1,16 @@
 """Scenes: from the specification and a clip's number to the clip.
 
-Before: spec.py, assets.py, stages.py, lit_stages.py, casts.py.  After: samples.py.
+Before: spec.py, assets.py, stages.py, lit_stages.py, casts.py, wraps.py.  After: samples.py.
 Clip number c depends on (seed, c) and the assets, never on other clips.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from pathlib import Path as FilePath
 
 import numpy as np
@@ -21,11 +23,13 @@ from datagen.clips import Actor, Clip
 from datagen.lit_stages import choose_lit_stage, is_clip_lit
 from datagen.motions import PlayedVertices, RigidBody, turns
 from datagen.patterns import lit_color, paint, palette_colours
+from datagen.photos import survey_photos
 from datagen.seeds import open_stream
 from datagen.sequences import load_sequence, survey_sequence
 from datagen.shapes import Shape
 from datagen.spec import DatasetSpec, parse_spec
 from datagen.stages import choose_stage
+from datagen.wraps import choose_background, wrap_actors
 
 NO_ASSETS = Roster((), (), "")
 
@@ -36,7 +40,9 @@ class Plan:
 
     spec: DatasetSpec
     asset_names: tuple[str, ...]  # relative to spec.assets
-    assets_sha256: str
+    assets_sha256: str  # of pictures too
+    texture_names: tuple[str, ...] = ()  # relative to spec.textures
+    background_names: tuple[str, ...] = ()  # relative to spec.backgrounds
 
     @property
     def config_sha256(self) -> str:
@@ -45,27 +51,41 @@ class Plan:
 
     def to_json(self) -> str:
         """Return the plan as text that `plan_from_json` reads back equal."""
-        fields = {"spec": self.spec.model_dump(), "asset_names": self.asset_names, "assets_sha256": self.assets_sha256}
-        return json.dumps(fields, sort_keys=True)
+        names = (f.name for f in fields(self) if f.name != "spec")
+        told = {"spec": self.spec.model_dump()} | {name: getattr(self, name) for name in names}
+        return json.dumps(told, sort_keys=True)
 
 
 def plan_from_json(text: str) -> Plan:
     """Return the plan that `Plan.to_json` wrote. Source: ours."""
-    fields = json.loads(text)
-    return Plan(parse_spec(fields["spec"]), tuple(fields["asset_names"]), fields["assets_sha256"])
+    told = json.loads(text)
+    names = {name: tuple(told[name]) for name in ("asset_names", "texture_names", "background_names")}
+    return Plan(spec=parse_spec(told["spec"]), assets_sha256=told["assets_sha256"], **names)
 
 
-def survey_assets(spec: DatasetSpec) -> Roster:
-    """Read all assets once.
+def survey_plan(spec: DatasetSpec) -> tuple[Plan, tuple[tuple[str, str], ...]]:
+    """Read all assets and pictures once and return the plan, and the files refused, with the reason.
 
     Raises:
-        MeshError: none of them can be used.
+        MeshError: none of the assets, of the textures or of the backgrounds can be used.
 
     Source: ours.
     """
-    if spec.source == "primitives":
-        return NO_ASSETS
-    return survey_meshes(str(spec.assets)) if spec.source == "meshes" else survey_sequence(str(spec.assets))
+    roster, total = NO_ASSETS, hashlib.sha256()
+    if spec.source != "primitives":
+        roster = survey_meshes(str(spec.assets)) if spec.source == "meshes" else survey_sequence(str(spec.assets))
+    total.update(roster.sha256.encode())
+    names: dict[str, tuple[str, ...]] = {}
+    refused = list(roster.refused)
+    for role, folder in (("textures", spec.textures), ("backgrounds", spec.backgrounds)):
+        if folder is None:
+            continue
+        photos = survey_photos(folder)
+        names[f"{role[:-1]}_names"] = photos.names
+        refused += [(f"{role}/{name}", reason) for name, reason in photos.refused]
+        total.update(f"{role} {photos.sha256}".encode())
+    sha256 = total.hexdigest() if names else roster.sha256
+    return Plan(spec, roster.names, sha256, **names), tuple(refused)
 
 
 def build_clip(plan: Plan, clip: int) -> Clip:
@@ -94,12 +114,36 @@ def build_clip(plan: Plan, clip: int) -> Clip:
         cast = _mesh_cast(plan, rngs, colours, notes, is_lit)
     else:
         cast = [_sequence_actor(plan, rngs, colours, notes, is_lit)]
+    has_photo = bool(plan.background_names)
     if is_lit:
-        stage = choose_lit_stage((rngs["camera"], open_stream(spec.seed, "lamps", clip)), colours, size, cast)
+        rng = open_stream(spec.seed, "lamps", clip)
+        stage = choose_lit_stage((rngs["camera"], rng), colours, size, cast, has_photo)
     else:
         stage = choose_stage((rngs["camera"], rngs["backdrop"]), colours, size)
+        stage = replace(stage, actors=(), kinds=stage.kinds | {"backdrop": "picture"}) if has_photo else stage
     notes |= stage.kinds
-    return Clip((*stage.actors, *cast), stage.camera, stage.background, notes, stage.lamps, stage.ambient)
+    actors, background = _with_pictures(plan, clip, (stage.actors, cast), stage.background, notes)
+    return Clip(actors, stage.camera, background, notes, stage.lamps, stage.ambient)
+
+
+def _with_pictures(
+    plan: Plan,
+    clip: int,
+    actors: tuple[Sequence[Actor], Sequence[Actor]],
+    background: Tensor,
+    notes: dict[str, object],
+) -> tuple[tuple[Actor, ...], Tensor]:
+    """Return the actors, backdrop and cast, and the background, with people's pictures where the plan has any."""
+    spec, (backdrop, cast) = plan.spec, actors
+    rng = open_stream(spec.seed, "pictures", clip)
+    if plan.background_names:
+        size = (spec.width, spec.height)
+        background, notes["background"] = choose_background(rng, str(spec.backgrounds), plan.background_names, size)
+    everyone = [*backdrop, *cast]
+    if plan.texture_names:
+        folder = str(spec.textures)
+        everyone, notes["textures"] = wrap_actors(everyone, len(backdrop), rng, folder, plan.texture_names)
+    return tuple(everyone), background
 
 
 def _mesh_cast(

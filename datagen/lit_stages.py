@@ -32,6 +32,7 @@ MOVING_SHARE = 0.45  # of the lamps
 LOWEST, HIGHEST = -2.6, -1.2  # of the floor [scene units]
 PLAYED_S = 2.0  # during which the floor is to stay below the actors
 WALL_Z = -3.4
+PICTURE_ALBEDO = 0.35  # of a bright photograph
 WHITE = (0.75, 1.7)  # least and most that a white floor sends
 
 
@@ -46,6 +47,7 @@ def choose_lit_stage(
     size: tuple[int, int],
     cast: Sequence[Actor],
     is_open: bool = False,
+    has_textures: bool = False,
 ) -> Stage:
     """Return camera, floor or walls, and lamps.
 
@@ -55,6 +57,7 @@ def choose_lit_stage(
         size: width and height of the image [px].
         cast: who moves above the floor.
         is_open: the background must be in view: a floor and no walls.
+        has_textures: floor and walls will wear pictures instead of the palette's colours.
 
     Source: ours.
     """
@@ -71,7 +74,7 @@ def choose_lit_stage(
     for name, shape, place in _surfaces(kind, floor_y, math.hypot(*camera.eye.start)):
         pair = torch.stack([main, second] if name != "wall" else [second, main])
         actors.append(still(name, shape, paint(shape, pair, quiet(rng), rng), place, is_lit=True))
-    lamps, ambient = choose_lamps(rng, kind, float((main + second).mean() / 2))
+    lamps, ambient = choose_lamps(rng, kind, PICTURE_ALBEDO if has_textures else float((main + second).mean() / 2))
     kinds = {"camera": camera_kind, "backdrop": kind, "lamps": " ".join(lamp.kind for lamp in lamps)}
     return Stage(camera, tuple(actors), sky.to(torch.float32), kinds, lamps, ambient)
 

@@ -117,7 +117,7 @@ def build_clip(plan: Plan, clip: int) -> Clip:
     has_photo = bool(plan.background_names)
     if is_lit:
         rng = open_stream(spec.seed, "lamps", clip)
-        stage = choose_lit_stage((rngs["camera"], rng), colours, size, cast, has_photo)
+        stage = choose_lit_stage((rngs["camera"], rng), colours, size, cast, has_photo, bool(plan.texture_names))
     else:
         stage = choose_stage((rngs["camera"], rngs["backdrop"]), colours, size)
         stage = replace(stage, actors=(), kinds=stage.kinds | {"backdrop": "picture"}) if has_photo else stage

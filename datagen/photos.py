@@ -100,7 +100,7 @@ def load_background(path: str, size: tuple[int, int], place: tuple[float, float]
 
     Source: ours.
     """
-    photo = _linear(path, file_state(Path(path)))
+    photo = _linear(path)
     height, width = photo.shape[:2]
     scale = min(width / size[0], height / size[1])  # picture pixels of an image pixel
     part = (size[0] * scale, size[1] * scale)
@@ -112,16 +112,15 @@ def load_background(path: str, size: tuple[int, int], place: tuple[float, float]
 @functools.lru_cache(maxsize=16)  # clips of a worker draw from the same few files
 def _texture(path: str, state: tuple[int, int]) -> Tensor:
     """Return the texture of a file in a certain state."""
-    photo = _linear(path, state)
+    photo = _linear(path)
     height, width = photo.shape[:2]
     shrink = min(1.0, TEXTURE_PX / max(height, width))
     size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
     return torch.from_numpy(resample(photo, size, (0.0, 0.0, float(width), float(height))))
 
 
-@functools.lru_cache(maxsize=2)
-def _linear(path: str, state: tuple[int, int]) -> np.ndarray:
-    """Return the (h, w, 3) float32 linear light of a file in a certain state."""
+def _linear(path: str) -> np.ndarray:
+    """Return the (h, w, 3) float32 linear light of a file."""
     pixels = read_photo(Path(path))
     table = linear_from_srgb((torch.arange(256, dtype=torch.float64) / 255).unsqueeze(1).expand(256, 3))[:, 0]
     return table.to(torch.float32).numpy()[pixels]

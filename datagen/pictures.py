@@ -13,7 +13,7 @@ from PIL import Image, ImageDraw, ImageOps
 
 PHOTO_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 PHOTO_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")  # of 8 bits a channel at most
-MAX_PHOTO_PIXELS = 100_000_000
+MAX_PHOTO_PIXELS = 60_000_000  # as linear light 12 bytes each
 
 
 class PhotoError(ValueError):

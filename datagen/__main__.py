@@ -53,7 +53,7 @@ class Arguments:
     rays_per_pixel: int = 4
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
-    """Frames per second at which a sequence is played."""
+    """Frames per second at which a sequence of frames is played; an animated file has its own times."""
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""

@@ -47,7 +47,7 @@ class DatasetSpec(BaseModel):
         fps: frames per second of a clip [Hz]; the sharp instants are 1/fps apart.
         exposure: share of the frame time 1/fps during which the shutter is open, in (0, 1].
         rays_per_pixel: rays inside each pixel, 1 = its centre.
-        sequence_fps: at what rate a sequence is played [Hz].
+        sequence_fps: at what rate the frames of a sequence are played [Hz]; an animated file has its own times.
         baselines: filters whose images are stored beside the exact one: names from BASELINES, between commas.
         storage: `folder` (a file for each thing), `shards` (tar files of many frames, as WebDataset has them) or
             `auto`: a folder below 1,000 frames.

@@ -1,6 +1,6 @@
 """Animated assets: files whose mesh moves by itself, brought to one size and played in a clip.
 
-Before: assets.py, gltf_rigs.py, motions.py.  After: rosters.py, scenes.py.
+Before: assets.py, gltf_rigs.py, usd_files.py, motions.py.  After: rosters.py, scenes.py.
 Symbols: N times [s], V vertices, F faces. Poses are computed at the very times that are asked for; nothing is baked.
 Source: ours.
 """
@@ -21,8 +21,10 @@ from datagen.gltf import GltfFile
 from datagen.gltf_rigs import read_rig
 from datagen.motions import RigidMotion
 from datagen.rigs import Rig, Take
+from datagen.usd_files import USD_SUFFIXES, UsdMeshes, read_usd
 
 GLTF_SUFFIXES = (".gltf", ".glb")
+ANIMATED_SUFFIXES = (*GLTF_SUFFIXES, *USD_SUFFIXES)
 EVEN_PROBES = 33  # instants at which an animation is measured, beside its keys
 KEY_PROBES = 64  # at most that many keys
 AT_ONCE = 4  # of these; bounds the memory
@@ -55,6 +57,22 @@ class RigPose:
     def at(self, times_s: Tensor) -> Tensor:
         """Return (N, V, 3) float64 positions at times (N,) [s]. Source: ours."""
         return self.rig.at(self.take, times_s)
+
+
+@dataclass(frozen=True, eq=False)
+class UsdPose:
+    """The meshes of a USD file."""
+
+    meshes: UsdMeshes
+
+    @functools.cached_property
+    def keys_s(self) -> Tensor:
+        """The (T,) times of its samples [s]."""
+        return torch.from_numpy(self.meshes.keys_s)
+
+    def at(self, times_s: Tensor) -> Tensor:
+        """Return (N, V, 3) float64 positions at times (N,) [s]. Source: ours."""
+        return torch.stack([torch.from_numpy(self.meshes.at(time_s)) for time_s in times_s.tolist()])
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +166,7 @@ class PlayedAction:
 
 
 def is_animated(path: str | Path) -> bool:
-    """Tell whether a file is one that `load_animated` reads and whose mesh moves or is skinned.
+    """Tell whether a file is for `load_animated`: USD, or glTF whose mesh moves or is skinned.
 
     Raises:
         MeshError: it cannot be read.
@@ -157,7 +175,7 @@ def is_animated(path: str | Path) -> bool:
     """
     place = Path(path)
     if place.suffix.lower() not in GLTF_SUFFIXES:
-        return False
+        return place.suffix.lower() in USD_SUFFIXES
     return _is_animated(str(path), file_state(place))
 
 
@@ -183,6 +201,8 @@ def _is_animated(path: str, state: tuple[int, int]) -> bool:
 def _load_animated(path: str, state: tuple[int, int]) -> AnimatedAsset:
     """Return the asset of a file in a certain state."""
     place = Path(path)
+    if place.suffix.lower() in USD_SUFFIXES:
+        return _usd_asset(place)
     try:
         file = GltfFile(place)
         read = read_rig(file)
@@ -193,6 +213,18 @@ def _load_animated(path: str, state: tuple[int, int]) -> AnimatedAsset:
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RuntimeError, RecursionError) as error:
         raise MeshError(path, f"expected a readable {place.suffix} file, got {short_reason(error)}") from None
     return AnimatedAsset(place.name, actions, read.faces, read.color, read.opacity, read.notes, digest)
+
+
+def _usd_asset(path: Path) -> AnimatedAsset:
+    """Return the asset of a USD file."""
+    read = read_usd(path)
+    faces = torch.from_numpy(read.faces)
+    action = measure(path, "time samples", UsdPose(read), faces)
+    color, opacity = None, None
+    if read.rgba is not None:
+        rgba = torch.from_numpy(read.rgba)
+        color, opacity = rgba[:, :3].contiguous(), rgba[:, 3].contiguous() if bool((rgba[:, 3] < 1).any()) else None
+    return AnimatedAsset(path.name, (action,), faces, color, opacity, read.notes, read.sha256)
 
 
 def measure(path: Path, name: str, pose: Pose, faces: Tensor) -> Action:

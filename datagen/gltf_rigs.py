@@ -14,14 +14,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datagen.formats import MAX_PLAYED_FACES, MAX_PLAYED_VERTICES
 from datagen.gltf import GltfFile
 from datagen.gltf_looks import face_looks
 from datagen.gltf_takes import n_targets, read_takes, unit_quaternion
 from datagen.rigs import Node, Part, Rig, Skin, Take
 
 MAX_NODES = 4096
-MAX_RIG_VERTICES = 500_000  # of all instances; a playing mesh is held at some 100 instants at once
-MAX_RIG_FACES = 1_000_000
 TRIANGLES, STRIP, FAN = 4, 5, 6
 NO_LOOK = np.array([[0.45, 0.45, 0.45, 1.0]])  # linear; of parts without a colour beside parts that have one
 
@@ -66,8 +65,10 @@ def read_rig(file: GltfFile) -> RigFile:
             parts.append(part)
             faces.append(triangles + start)
             start += len(part.vertices)
-            if start > MAX_RIG_VERTICES or sum(map(len, faces)) > MAX_RIG_FACES:
-                raise file.fail(f"expected at most {MAX_RIG_VERTICES} vertices and {MAX_RIG_FACES} faces, got more")
+            if start > MAX_PLAYED_VERTICES or sum(map(len, faces)) > MAX_PLAYED_FACES:
+                raise file.fail(
+                    f"expected at most {MAX_PLAYED_VERTICES} vertices and {MAX_PLAYED_FACES} faces, got more"
+                )
             looks.append(face_looks(file, primitive, triangles, len(part.vertices)))
     if not parts or not sum(map(len, faces)):
         raise file.fail("expected triangles, got none")

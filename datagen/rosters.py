@@ -10,14 +10,15 @@ import hashlib
 import os
 from pathlib import Path
 
-from datagen.animated import is_animated, load_animated
+from datagen.animated import ANIMATED_SUFFIXES, AnimatedAsset, is_animated, load_animated
 from datagen.assets import MESH_SUFFIXES, Roster, load_mesh, tensors_sha256
 from datagen.formats import MeshError
 from datagen.sequences import survey_sequence
+from datagen.usd_files import USD_SUFFIXES, vet_usd
 
 # Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
 UNREAD_SUFFIXES = (
-    ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usd", ".usda", ".usdc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
+    ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
     ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
 )  # fmt: skip
 
@@ -34,8 +35,8 @@ def survey_meshes(folder: str | Path) -> Roster:
     for name in _files_under(folder):
         suffix = Path(name).suffix.lower()
         if suffix in UNREAD_SUFFIXES:
-            refused.append((name, f"expected one of {', '.join(MESH_SUFFIXES)}, got a {suffix} file"))
-        if suffix not in MESH_SUFFIXES:
+            refused.append((name, f"expected one of {', '.join((*MESH_SUFFIXES, *USD_SUFFIXES))}, got a {suffix} file"))
+        if suffix not in (*MESH_SUFFIXES, *ANIMATED_SUFFIXES):
             continue
         path = Path(folder) / name
         try:
@@ -60,15 +61,22 @@ def survey_played(path: str | Path) -> Roster:
     Source: ours.
     """
     if is_animated(path):
-        asset = load_animated(str(path))
+        asset = _vetted(Path(path))
         return Roster((asset.name,), (), asset.sha256)
     return survey_sequence(path)
+
+
+def _vetted(path: Path) -> AnimatedAsset:
+    """Return an animated file, if need be after another process has read it first."""
+    if path.suffix.lower() in USD_SUFFIXES:
+        vet_usd(path)
+    return load_animated(str(path))
 
 
 def _content(path: Path) -> bytes:
     """Return the hash of what a mesh file holds, animated or not."""
     if is_animated(path):
-        return bytes.fromhex(load_animated(str(path)).sha256)
+        return bytes.fromhex(_vetted(path).sha256)
     asset = load_mesh(str(path))
     return tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity)
 

@@ -77,6 +77,7 @@ DOORS = {  # third-party package: the only files that may import it (stems; "*" 
     "tomli": {"datagen": {"spec"}},
     "tomllib": {"datagen": {"spec"}},
     "ray": {"datagen": {"ray_executor"}},
+    "pxr": {"datagen": {"usd_files"}},
     "numba": {"torchblur": set()},
     "matplotlib": {},
 }

@@ -66,11 +66,15 @@ class RigidMotion:
         return self.path.is_static and self.spin_rad_s == 0
 
     def place(self, vertices: Tensor, times_s: Tensor) -> Tensor:
-        """Return (N, V, 3) float64 world positions of the body's vertices (V, 3) at times (N,) [s]. Source: ours."""
+        """Return (N, V, 3) float64 world positions of the body's vertices, (V, 3) or (N, V, 3), at times (N,) [s].
+
+        Source: ours.
+        """
         rest_angle = math.hypot(*self.rest)
         rest = turns(self.rest if rest_angle else (1.0, 0.0, 0.0), torch.tensor([rest_angle], dtype=torch.float64))[0]
         rotation = turns(self.axis, times_s.to(torch.float64) * self.spin_rad_s) @ rest  # (N, 3, 3)
-        turned = torch.einsum("nij,vj->nvi", rotation, vertices.to(torch.float64))
+        paths = "nij,vj->nvi" if vertices.ndim == 2 else "nij,nvj->nvi"
+        turned = torch.einsum(paths, rotation, vertices.to(torch.float64))
         return turned + self.path.at(times_s).unsqueeze(1)
 
 

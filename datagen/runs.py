@@ -1,6 +1,6 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py, run_log.py.
+Before: samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py, run_log.py.
 After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
@@ -16,6 +16,7 @@ from datagen.executors import Outcome, Task, run_processes, run_serial
 from datagen.folders import Slice, locked_folder, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
+from datagen.ray_executor import check_ray, run_ray
 from datagen.report import effect_shares, write_contact_sheet
 from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
@@ -26,6 +27,7 @@ from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import write_atomically, write_frame
 
 FAILURES_NAME = "failures.json"
+EXECUTORS = ("local", "ray")
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,12 @@ class RunResult:
 
 
 def generate(
-    spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: bool = True, part: Slice | None = None
+    spec: DatasetSpec,
+    out: str | Path,
+    workers: int = 1,
+    is_quiet: bool = True,
+    part: Slice | None = None,
+    executor: str = "local",
 ) -> RunResult:
     """Make the data set, or what is missing of it, and return what was achieved.
 
@@ -61,16 +68,21 @@ def generate(
         workers: processes; 0 and 1 work in this one.
         is_quiet: show no progress on stderr.
         part: make these shards only; other slices may be made at the same time. Needs storage `shards`.
+        executor: one of EXECUTORS: `local` (processes of this machine) or `ray` (Ray's workers, `workers` at a time).
 
     Raises:
         SpecError: the folder holds other data, is held by another run, or `workers` is negative, or a slice of what
-            is not stored in shards is asked for.
+            is not stored in shards is asked for, or the executor is not there.
         MeshError: none of the assets can be used; nothing has been written then.
 
     Source: ours.
     """
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
         raise SpecError([f"workers: expected an integer of at least 0, got {workers!r}"])
+    if executor not in EXECUTORS:
+        raise SpecError([f"executor: expected one of {', '.join(EXECUTORS)}, got {executor!r}"])
+    if executor == "ray":
+        check_ray()
     spec = settle_storage(spec, Path(out))
     if part is not None and spec.storage != "shards":
         raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
@@ -87,10 +99,13 @@ def generate(
             for line in repaired:
                 progress.say(line)
             text = plan.to_json()
-            if workers <= 1:
+            processes = min(max(workers, 1), max(len(run.todo), 1))
+            if executor == "ray":
+                outcomes = run_ray(run.task, text, str(folder), run.todo, processes)
+            elif workers <= 1:
                 outcomes = run_serial(run.task, text, str(folder), run.todo)
             else:
-                outcomes = run_processes(run.task, text, str(folder), run.todo, min(workers, max(len(run.todo), 1)))
+                outcomes = run_processes(run.task, text, str(folder), run.todo, processes)
             for outcome in outcomes:
                 made, lost = _frames_of(outcome, run)
                 failed += lost

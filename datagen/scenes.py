@@ -1,6 +1,6 @@
 """Scenes: from the specification and a clip's number to the clip.
 
-Before: spec.py, assets.py, stages.py, lit_stages.py, casts.py, wraps.py.  After: samples.py.
+Before: spec.py, rosters.py, photos.py, stages.py, lit_stages.py, casts.py, wraps.py.  After: samples.py.
 Clip number c depends on (seed, c) and the assets, never on other clips.
 """
 
@@ -17,15 +17,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datagen.assets import Roster, load_mesh, survey_meshes
+from datagen.animated import PlayedAction, is_animated, load_animated
+from datagen.assets import Roster, load_mesh
 from datagen.casts import build_cast, choose_motion, choose_places
 from datagen.clips import Actor, Clip
 from datagen.lit_stages import choose_lit_stage, is_clip_lit
-from datagen.motions import PlayedVertices, RigidBody, turns
+from datagen.motions import Path, PlayedVertices, RigidBody, RigidMotion, turns
 from datagen.patterns import lit_color, paint, palette_colours
 from datagen.photos import survey_photos
+from datagen.rosters import survey_meshes, survey_played
 from datagen.seeds import open_stream
-from datagen.sequences import load_sequence, survey_sequence
+from datagen.sequences import load_sequence
 from datagen.shapes import Shape
 from datagen.spec import DatasetSpec, parse_spec
 from datagen.stages import choose_stage
@@ -63,6 +65,19 @@ def plan_from_json(text: str) -> Plan:
     return Plan(spec=parse_spec(told["spec"]), assets_sha256=told["assets_sha256"], **names)
 
 
+def survey_assets(spec: DatasetSpec) -> Roster:
+    """Read all assets once.
+
+    Raises:
+        MeshError: none of them can be used.
+
+    Source: ours.
+    """
+    if spec.source == "primitives":
+        return NO_ASSETS
+    return survey_meshes(str(spec.assets)) if spec.source == "meshes" else survey_played(str(spec.assets))
+
+
 def survey_plan(spec: DatasetSpec) -> tuple[Plan, tuple[tuple[str, str], ...]]:
     """Read all assets and pictures once and return the plan, and the files refused, with the reason.
 
@@ -71,10 +86,8 @@ def survey_plan(spec: DatasetSpec) -> tuple[Plan, tuple[tuple[str, str], ...]]:
 
     Source: ours.
     """
-    roster, total = NO_ASSETS, hashlib.sha256()
-    if spec.source != "primitives":
-        roster = survey_meshes(str(spec.assets)) if spec.source == "meshes" else survey_sequence(str(spec.assets))
-    total.update(roster.sha256.encode())
+    roster = survey_assets(spec)
+    total = hashlib.sha256(roster.sha256.encode())
     names: dict[str, tuple[str, ...]] = {}
     refused = list(roster.refused)
     for role, folder in (("textures", spec.textures), ("backgrounds", spec.backgrounds)):
@@ -154,19 +167,29 @@ def _mesh_cast(
     n = int(rng.choice((1, 2, 3), p=(0.4, 0.35, 0.25)))
     aspect = spec.width / spec.height
     places = choose_places(rng, n, aspect)
-    actors, not_used = [], []
+    actors, not_used, played = [], [], {}
     for k in range(n):
         name = plan.asset_names[int(rng.integers(0, len(plan.asset_names)))]
-        asset = load_mesh(str(FilePath(str(spec.assets)) / name))
+        path = str(FilePath(str(spec.assets)) / name)
         size = float(rng.uniform(1.25, 1.75)) * (1.0, 0.8, 0.66)[n - 1] * min(1.0, max(aspect, 0.5))
-        shape = Shape(asset.vertices * size, asset.faces, _flat_uv(asset.vertices, asset.faces), False)
         place = tuple(0.35 * c for c in places[0]) if n == 1 else tuple(0.8 * c for c in places[k])
+        if is_animated(path):
+            motion = choose_motion(rngs["motion"], place, size)
+            actor, told, unread = _animated_actor(path, f"{name}-{k}", (size, motion), (rngs, colours, is_lit))
+            actors.append(actor)
+            played[actor.name] = told
+            not_used += [f"{name}: {note}" for note in unread]
+            continue
+        asset = load_mesh(path)
+        shape = Shape(asset.vertices * size, asset.faces, _flat_uv(asset.vertices, asset.faces), False)
         body = RigidBody(shape.vertices, choose_motion(rngs["motion"], place, size))
         color = _asset_color(shape, asset.color, colours, rngs["colour"], is_lit)
         opacity: Tensor | float = 1.0 if asset.opacity is None else asset.opacity.to(torch.float32)
         actors.append(Actor(f"{name}-{k}", shape.faces, color, body, opacity, is_lit=is_lit))
         not_used += [f"{name}: {note}" for note in asset.notes]
     notes["assets"] = sorted({a.name.rsplit("-", 1)[0] for a in actors})
+    if played:
+        notes["animations"] = played
     if not_used:
         notes["not_used"] = sorted(set(not_used))
     return actors
@@ -177,9 +200,18 @@ def _sequence_actor(
 ) -> Actor:
     """Return the sequence as one body: turned about the vertical and started somewhere, by the clip."""
     rng, spec = rngs["cast"], plan.spec
-    asset = load_sequence(str(spec.assets))
     angle = torch.tensor([float(rng.uniform(-math.pi, math.pi))], dtype=torch.float64)
     size = 1.75 * min(1.0, max(spec.width / spec.height, 0.5))
+    if is_animated(str(spec.assets)):
+        motion = RigidMotion(Path((0.0, 0.0, 0.0)), rest=(0.0, float(angle), 0.0))
+        actor, told, unread = _animated_actor(
+            str(spec.assets), FilePath(str(spec.assets)).name, (size, motion), (rngs, colours, is_lit)
+        )
+        notes["animations"] = {actor.name: told}
+        if unread:
+            notes["not_used"] = list(unread)
+        return actor
+    asset = load_sequence(str(spec.assets))
     positions = asset.positions @ turns((0.0, 1.0, 0.0), angle)[0].T * size
     length_s = max(len(positions) - 1, 0) / spec.sequence_fps
     start_s = float(rng.uniform(0, 2 * length_s))
@@ -196,6 +228,28 @@ def _sequence_actor(
         notes["not_used"] = list(asset.notes)
     motion = PlayedVertices(positions, spec.sequence_fps, start_s)
     return Actor(asset.name, asset.faces, color, motion, is_lit=is_lit)
+
+
+def _animated_actor(
+    path: str, name: str, body: tuple[float, RigidMotion], looks: tuple[dict[str, np.random.Generator], Tensor, bool]
+) -> tuple[Actor, dict[str, object], tuple[str, ...]]:
+    """Return an animated file as an actor of a size and a motion, what is played of it, and what in it is not used."""
+    (size, motion), (rngs, colours, is_lit) = body, looks
+    rng, asset = rngs["cast"], load_animated(path)
+    action = asset.actions[int(rng.integers(0, len(asset.actions)))]
+    start_s = float(rng.uniform(0, 2 * action.length_s))
+    player = PlayedAction(action, start_s, size, motion)
+    rest = player.resting()
+    shape = Shape(rest, asset.faces, _flat_uv(rest, asset.faces), False)
+    color = _asset_color(shape, asset.color, colours, rngs["colour"], is_lit)
+    opacity: Tensor | float = 1.0 if asset.opacity is None else asset.opacity.to(torch.float32)
+    told: dict[str, object] = {
+        "name": action.name,
+        "length_s": action.length_s,
+        "start_s": start_s,
+        "played": "round and round" if action.is_round else "back and forth",
+    }
+    return Actor(name, asset.faces, color, player, opacity, is_lit=is_lit), told, asset.notes
 
 
 def _asset_color(shape: Shape, given: Tensor | None, colours: Tensor, rng: np.random.Generator, is_lit: bool) -> Tensor:

@@ -20,7 +20,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc")
 BASELINES = ("directional", "mcguire2012", "guertin2014", "guertin2015")  # in baselines/filters.py, which needs torch
 # A longer run extends a shorter one; a folder's place is not its content; storage does not change a frame's files.
 NOT_IN_THE_BYTES = ("count", "assets", "textures", "backgrounds", "storage", "frames_per_shard")
@@ -48,7 +48,7 @@ class DatasetSpec(BaseModel):
         fps: frames per second of a clip [Hz]; the sharp instants are 1/fps apart.
         exposure: share of the frame time 1/fps during which the shutter is open, in (0, 1].
         rays_per_pixel: rays inside each pixel, 1 = its centre.
-        sequence_fps: at what rate a sequence is played [Hz].
+        sequence_fps: at what rate the frames of a sequence are played [Hz]; an animated file has its own times.
         lighting: `painted` (a fixed light is painted into colours), `lamps` (moving lamps light the clips, which have
             a floor or walls for their shadows) or `mixed`: one or the other, clip by clip.
         textures: a folder of pictures that floors, walls and half of the bodies wear.

@@ -6,6 +6,7 @@ import re
 import numpy as np
 import pytest
 import torch
+from gltf_makers import spinner
 from PIL import Image
 from torch.utils.data import DataLoader
 
@@ -19,7 +20,7 @@ from datagen.lit_stages import HIGHEST, LOWEST, PLACES, is_clip_lit
 from datagen.motions import CameraPath, Path, RigidBody, RigidMotion, Sway
 from datagen.report import write_contact_sheet
 from datagen.samples import make_sample, render_sample
-from datagen.scenes import Plan, build_clip
+from datagen.scenes import Plan, build_clip, survey_plan
 from datagen.shapes import sheet
 from datagen.writer import read_exr, sample_parts
 
@@ -326,3 +327,21 @@ def test_lighting_is_refused_by_name_and_is_part_of_the_configuration(tmp_path, 
 
 def _words(fields):
     return [word for k, v in fields.items() for word in (f"--{k.replace('_', '-')}", str(v))]
+
+
+@pytest.mark.parametrize("source", ["meshes", "sequence"])
+def test_lamps_light_animated_files_and_they_wear_pictures(tmp_path, source):
+    (tmp_path / "assets").mkdir()
+    (tmp_path / "pictures").mkdir()
+    spinner(degrees=120).save(tmp_path / "assets/a.glb")
+    Image.new("RGB", (4, 4), (200, 90, 30)).save(tmp_path / "pictures/a.png")
+    assets = tmp_path / "assets" if source == "meshes" else tmp_path / "assets/a.glb"
+    fields = {"lighting": "lamps", "source": source, "assets": str(assets), "textures": str(tmp_path / "pictures")}
+    here, refused = survey_plan(parse_spec(TINY | fields))
+    assert refused == ()
+    clips = [build_clip(here, number) for number in range(8)]
+    assert all(actor.is_lit for clip in clips for actor in clip.actors)
+    assert any(actor.texture is not None and actor.name.startswith("a.glb") for c in clips for actor in c.actors)
+    frame = make_sample(here.to_json(), 1)
+    assert frame.meta["lamps"]
+    assert bool(torch.isfinite(frame.blurred).all())

@@ -55,8 +55,7 @@ class Arguments:
     sequence_fps: float = 24.0
     """Frames per second at which a sequence of frames is played; an animated file has its own times."""
     lighting: Literal["painted", "lamps", "mixed"] = "painted"
-    """A fixed light painted into the colours; lamps that move and cast shadows, which take longer; or one or the other,
-    clip by clip."""
+    """Light painted into the colours; lamps that move and cast shadows, which take longer; or either, clip by clip."""
     textures: str | None = None
     """Folder of pictures (PNG, JPEG, WebP, BMP) that floors, walls and half of the bodies wear."""
     backgrounds: str | None = None

@@ -9,7 +9,7 @@ import io
 import warnings
 
 import numpy as np
-from PIL import Image, ImageDraw, ImageOps
+from PIL import Image, ImageDraw, ImageOps, UnidentifiedImageError
 
 PHOTO_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 PHOTO_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")  # of 8 bits a channel at most
@@ -89,6 +89,8 @@ def decode_photo(data: bytes) -> np.ndarray:
                 return np.asarray(upright.convert("RGB"))
     except PhotoError:
         raise
+    except UnidentifiedImageError:  # its text tells the address of our buffer
+        raise PhotoError(f"expected a readable {', '.join(PHOTO_FORMATS)}, got none of them") from None
     except Exception as error:  # the parsers raise OSError, ValueError, SyntaxError, struct.error and more
         why = " ".join(str(error).split())[:200]
         raise PhotoError(f"expected a readable {', '.join(PHOTO_FORMATS)}, got {type(error).__name__}: {why}") from None

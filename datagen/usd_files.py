@@ -318,8 +318,10 @@ def try_usd(path: Path) -> None:
     """
     read = read_usd(path)
     for time_s in np.linspace(read.keys_s[0], read.keys_s[-1], VET_TIMES):
-        if not (np.abs(read.at(float(time_s))) <= MAX_USD_VALUE).all():
-            raise MeshError(path, f"vertices: expected finite values of at most {MAX_USD_VALUE:g}, got others")
+        positions = read.at(float(time_s))
+        bad = positions[~(np.abs(positions) <= MAX_USD_VALUE)]  # NaN included
+        if len(bad):
+            raise MeshError(path, f"vertices: expected finite values of at most {MAX_USD_VALUE:g}, got {bad[0]:g}")
 
 
 def main(path: str) -> int:

@@ -206,18 +206,21 @@ def _is_animated(path: str, state: tuple[int, int]) -> bool:
 def _load_animated(path: str, state: tuple[int, int]) -> AnimatedAsset:
     """Return the asset of a file in a certain state."""
     place = Path(path)
-    if place.suffix.lower() in USD_SUFFIXES:
-        return _usd_asset(place)
     try:
-        file = GltfFile(place)
-        read = read_rig(file)
-        digest = file.digest.hexdigest()
-        actions = tuple(measure(place, take.name, RigPose(read.rig, take), read.faces) for take in read.takes)
+        return _usd_asset(place) if place.suffix.lower() in USD_SUFFIXES else _gltf_asset(place)
     except MeshError:
         raise
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RuntimeError, RecursionError) as error:
         raise MeshError(path, f"expected a readable {place.suffix} file, got {short_reason(error)}") from None
-    return AnimatedAsset(place.name, actions, read.faces, read.color, read.opacity, read.notes, digest)
+
+
+def _gltf_asset(path: Path) -> AnimatedAsset:
+    """Return the asset of a glTF file."""
+    file = GltfFile(path)
+    read = read_rig(file)
+    digest = file.digest.hexdigest()
+    actions = tuple(measure(path, take.name, RigPose(read.rig, take), read.faces) for take in read.takes)
+    return AnimatedAsset(path.name, actions, read.faces, read.color, read.opacity, read.notes, digest)
 
 
 def _usd_asset(path: Path) -> AnimatedAsset:

@@ -35,6 +35,7 @@ from datagen.formats import (
 USD_SUFFIXES = (".usd", ".usda", ".usdc")
 MAX_LAYERS = 64
 MAX_SAMPLES = 100_000  # times of all attributes together
+MAX_USD_VALUE = 1e6  # of a coordinate, as for all meshes
 VET_TIMES = 33  # instants at which a file is tried
 VET_SECONDS = 120
 VET_BYTES = 2 * 2**30  # of address space
@@ -70,7 +71,11 @@ def read_usd(path: Path) -> UsdMeshes:
     except MeshError:
         raise
     except (Tf.ErrorException, RuntimeError, ValueError, TypeError, IndexError, OverflowError) as error:
-        raise MeshError(path, f"expected a readable {path.suffix} file, got {short_reason(error)}") from None
+        try:
+            reason = short_reason(error)
+        except UnicodeDecodeError:  # the library quotes bytes of the file as if they were text
+            reason = type(error).__name__
+        raise MeshError(path, f"expected a readable {path.suffix} file, got {reason}") from None
 
 
 def vet_usd(path: Path) -> None:
@@ -195,7 +200,8 @@ def _topology(path: Path, mesh: Any) -> tuple[int, np.ndarray, tuple[np.ndarray,
     if (sizes < 0).any() or sizes.sum() != len(corners):
         raise MeshError(path, f"{name}: expected face sizes that sum to {len(corners)}, got {sizes.sum()}")
     if len(corners) and (corners.min() < 0 or corners.max() >= count):
-        raise MeshError(path, f"{name}: faces: expected indices in [0, {count}), got {corners.max()}")
+        outside = corners[(corners < 0) | (corners >= count)][0]
+        raise MeshError(path, f"{name}: faces: expected indices in [0, {count}), got {outside}")
     starts = np.cumsum(sizes) - sizes
     fans = np.maximum(sizes - 2, 0)
     polygon = np.repeat(np.arange(len(sizes)), fans)
@@ -302,8 +308,27 @@ def _positions(path: Path, stage: Any, meshes: list[tuple[Any, int]], code: floa
     return world
 
 
+def try_usd(path: Path) -> None:
+    """Read a file at VET_TIMES instants.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    read = read_usd(path)
+    for time_s in np.linspace(read.keys_s[0], read.keys_s[-1], VET_TIMES):
+        positions = read.at(float(time_s))
+        bad = positions[~(np.abs(positions) <= MAX_USD_VALUE)]  # NaN included
+        if len(bad):
+            raise MeshError(path, f"vertices: expected finite values of at most {MAX_USD_VALUE:g}, got {bad[0]:g}")
+
+
 def main(path: str) -> int:
-    """Try a file and return the exit code: 2, with the reason on stdout, if it cannot be used. Source: ours."""
+    """Try a file within VET_BYTES and return the exit code: 2, with the reason on stdout, if it cannot be used.
+
+    Source: ours.
+    """
     try:
         import resource
 
@@ -311,9 +336,7 @@ def main(path: str) -> int:
     except (ImportError, ValueError, OSError):  # not on this system
         pass
     try:
-        read = read_usd(Path(path))
-        for time_s in np.linspace(read.keys_s[0], read.keys_s[-1], VET_TIMES):
-            read.at(float(time_s))
+        try_usd(Path(path))
     except MeshError as error:
         print(error.reason)
         return 2

@@ -21,12 +21,14 @@ class Maker:
         self.tree |= {name: [] for name in ("nodes", "meshes", "accessors", "bufferViews")}
 
     def view(self, data):
+        """Add a buffer view and return its number."""
         self.data += b"\0" * (-len(self.data) % 4)
         self.tree["bufferViews"].append({"buffer": 0, "byteOffset": len(self.data), "byteLength": len(data)})
         self.data += data
         return len(self.tree["bufferViews"]) - 1
 
     def table(self, rows, dtype="<f4", **more):
+        """Add an accessor of rows and return its number."""
         rows = np.asarray(rows)
         rows = rows.reshape(len(rows), -1)
         entry = {"bufferView": self.view(rows.astype(dtype).tobytes()), "componentType": CODES[dtype]}
@@ -34,6 +36,7 @@ class Maker:
         return len(self.tree["accessors"]) - 1
 
     def mesh(self, vertices=SQUARE, faces=SQUARE_FACES, targets=(), **more):
+        """Add a mesh of one primitive and return its number."""
         attributes = {"POSITION": self.table(vertices)} | more.pop("attributes", {})
         primitive = {"attributes": attributes, "indices": self.table(faces, "<u2")} | more
         if targets:
@@ -42,10 +45,12 @@ class Maker:
         return len(self.tree["meshes"]) - 1
 
     def node(self, **fields):
+        """Add a node and return its number."""
         self.tree["nodes"].append(fields)
         return len(self.tree["nodes"]) - 1
 
     def skin(self, joints, binds=None):
+        """Add a skin and return its number."""
         skin = {"joints": joints}
         if binds is not None:  # rows of matrices that act on columns; the file has columns
             skin["inverseBindMatrices"] = self.table([np.asarray(b).T.ravel() for b in binds])
@@ -63,10 +68,12 @@ class Maker:
         self.tree.setdefault("animations", []).append({"name": name, "channels": made, "samplers": samplers})
 
     def embedded(self):
+        """Return the bytes of a .gltf file that holds its buffer."""
         uri = "data:application/octet-stream;base64," + base64.b64encode(self.data).decode()
         return json.dumps(self.tree | {"buffers": [{"byteLength": len(self.data), "uri": uri}]}).encode()
 
     def binary(self):
+        """Return the bytes of a .glb file."""
         text = json.dumps(self.tree | {"buffers": [{"byteLength": len(self.data)}]}).encode()
         text += b" " * (-len(text) % 4)
         data = self.data + b"\0" * (-len(self.data) % 4)
@@ -74,6 +81,7 @@ class Maker:
         return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
     def save(self, path, beside=False):
+        """Write the file, with its buffer beside it if asked to, and return its path."""
         if beside:
             path.with_suffix(".bin").write_bytes(self.data)
             buffer = {"byteLength": len(self.data), "uri": path.with_suffix(".bin").name}
@@ -90,7 +98,7 @@ def turn(axis, degrees):
 
 
 def spinner(kind="LINEAR", degrees=120.0):
-    """A square that turns about z in one second."""
+    """Return a square that turns about z in one second."""
     maker = Maker()
     node = maker.node(mesh=maker.mesh(), translation=[2, 0, 0])
     keys = [turn((0, 0, 1), 0), turn((0, 0, 1), degrees)]
@@ -99,7 +107,7 @@ def spinner(kind="LINEAR", degrees=120.0):
 
 
 def bender():
-    """A strip along x of two bones, at x 0 and 1; the second turns by 90 degrees about z in one second."""
+    """Return a strip along x of two bones, at x 0 and 1; the second turns by 90 degrees in one second."""
     maker = Maker()
     x = np.repeat([0.0, 0.5, 1.0, 1.5, 2.0], 2)
     vertices = np.stack([x, np.tile([-0.1, 0.1], 5), np.zeros(10)], 1)
@@ -120,7 +128,7 @@ def bender():
 
 
 def morpher():
-    """A square with two morph targets whose weights go from 0, 0 over 1, 0 to 0.5, 1 at 0, 1 and 2 s."""
+    """Return a square with two morph targets whose weights go from 0, 0 over 1, 0 to 0.5, 1 at 0, 1 and 2 s."""
     maker = Maker()
     up, aside = np.tile([0, 0, 1], (4, 1)), np.array([(0, 0, 0), (2, 0, 0), (0, 0, 0), (0, 0, 0)])
     node = maker.node(mesh=maker.mesh(targets=[up, aside]))

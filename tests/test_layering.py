@@ -76,6 +76,8 @@ DOORS = {  # third-party package: the only files that may import it (stems; "*" 
     "PIL": {"datagen": "*"},
     "tomli": {"datagen": {"spec"}},
     "tomllib": {"datagen": {"spec"}},
+    "ray": {"datagen": {"ray_executor"}},
+    "pxr": {"datagen": {"usd_files"}},
     "numba": {"torchblur": set()},
     "matplotlib": {},
 }

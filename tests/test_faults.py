@@ -16,7 +16,7 @@ import test_instant
 import test_seams
 import torch
 
-from torchblur import cells, edges, instant, intervals, packed, prisms, sampling, surfaces
+from torchblur import cells, edges, instant, intervals, packed, prisms, surfaces
 from torchblur.shutter import Shutter
 
 FLOAT64 = torch.float64
@@ -199,9 +199,9 @@ def plant_motion_upside_down(patch):
 
 
 def plant_accumulation_at_frame_starts(patch):
-    original = sampling.sum_of_instants
+    original = instant.sum_of_instants
     patch.setattr(
-        sampling,
+        instant,
         "sum_of_instants",
         lambda scene, faces, t, *rest: original(scene, faces, (t - t[0]).clamp(0, 1), *rest),
     )

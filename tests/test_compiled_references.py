@@ -57,7 +57,7 @@ def test_scenes_that_differ_in_everything(name, dtype):
 
 @pytest.mark.parametrize("casts_shadows", [False, True], ids=["plain", "shadows"])
 @pytest.mark.parametrize("name", lit_scenes.SCENES)
-def test_lit_scenes_take_the_hybrid_way(name, casts_shadows):
+def test_lit_scenes_compiled_or_with_shadows_in_the_hybrid_way(name, casts_shadows):
     compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=casts_shadows))
 
 

@@ -58,6 +58,7 @@ TORCHBLUR = [
     "cpu.jit",
     "cpu.motion",
     "cpu.raster",
+    "cpu.lambert",
     "cpu.layers",
     "cpu.instant",
     "instant",

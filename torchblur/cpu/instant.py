@@ -1,7 +1,7 @@
 """Sharp images on the CPU: what instant.py and fragments.py do, by the compiled scan of raster.py and layers.py.
 
 Before: raster.py, layers.py, fragments.py.  After: instant.py.
-Symbols: B instants, P pixels. Lit faces take the hybrid way: compiled search, then the looks of shading.py on what is
+Symbols: B instants, P pixels. Where shadows fall, the search is compiled, and shading.py and shadows.py look at what is
 visible. Rows of pixels are handed out in bands to a pool of threads; each pixel is summed by one of them, in the order
 of the instants, so that results do not depend on the number of threads.
 Source: ours.
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchblur.camera import Ray
 from torchblur.cpu import layers, raster
+from torchblur.cpu.lambert import find_lit
 from torchblur.cpu.motion import find_knots, vertices_at
 from torchblur.fragments import MAX_PAIRS, Fragments, fragments_of
 from torchblur.scene import Scene
@@ -30,8 +31,8 @@ AT_REST = np.zeros((1, 2))
 
 
 def compiles_looks(surfaces: Surfaces) -> bool:
-    """Return whether the looks of all faces are compiled: flat or textured, not lit. Ours."""
-    return not bool(surfaces.is_lit.any())
+    """Return whether the looks of all faces are compiled: all but what shadows may fall on. Ours."""
+    return surfaces.casters is None
 
 
 def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray: Ray) -> Iterator[Fragments]:
@@ -62,6 +63,7 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     knots, times = find_knots(scene), t.tolist()
     faces, looks, corner = faces_of(surfaces), looks_of(surfaces, scene, ray), corners_of(scene)
     rays, bounds = _grid(scene, ray), (ray.x_px, ray.x_px, ray.y_px, ray.y_px)
+    lit, moments = find_lit(scene, surfaces), t.reshape(-1, 1).numpy()
     weights = weight.detach().to(torch.float64).numpy()
 
     def place(k: int) -> raster.Shape:
@@ -73,8 +75,8 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
     total = np.zeros((camera.height * camera.width, 4))
 
     def add(rows: tuple[int, int]) -> None:
-        for shape, share in zip(shapes, weights, strict=True):
-            layers.add_seen(total, share, shape, (faces, looks), rays, rows)
+        for shape, share, when in zip(shapes, weights, moments, strict=True):
+            layers.add_seen(total, share, shape, (faces, looks, lit), rays._replace(t=when), rows)
 
     on_threads(add, bands_of(camera.height))
     return torch.from_numpy(total).reshape(camera.height, camera.width, 4)

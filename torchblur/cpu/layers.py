@@ -1,6 +1,6 @@
-"""What the rays of a band of rows see, compiled: layers in order of depth, flat and textured looks, their sum.
+"""What the rays of a band of rows see, compiled: layers in order of depth, their looks, their sum.
 
-Before: raster.py.  After: instant.py.
+Before: raster.py, lambert.py.  After: instant.py.
 Symbols: Q rays of the band, P of the block of rows; X texels, M meshes; a layer is a face met by a ray.
 Source: as texture.py (trilinear interpolation, Williams 1983) and packed.py (front-to-back OVER), operation by
 operation.
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu import raster
+from torchblur.cpu import lambert, raster
 from torchblur.cpu.jit import jit
 
 TIE = 1e-11  # relative: nearness of surfaces that count as coplanar
@@ -104,9 +104,9 @@ def layers_of(q, found, nodes, faces, scratch):
 @jit
 def add_seen(total, weight, shape, appearance, rays, rows):
     """Add to `total` (H W, 4) what the rays of a band see, premultiplied, by `weight` (P,) or (1,); `appearance` is
-    `Faces` and `Looks`.
+    `Faces`, `Looks` and `Lit`.
     """
-    faces, looks = appearance
+    faces, looks, lit = appearance
     found, nodes, _ = find(shape, faces, rays, rows)
     scratch = (np.empty(64), np.empty(64, np.int32), np.empty(64, np.int32))
     for q in range(len(found.face)):
@@ -114,7 +114,7 @@ def add_seen(total, weight, shape, appearance, rays, rows):
         share = weight[p] if len(weight) > 1 else weight[0]
         if found.head[q] < 0:
             if found.face[q] >= 0:
-                red, green, blue, _ = look(shape, looks, rays, p, found.face[q], found.part[q])
+                red, green, blue, _ = look(shape, (looks, lit), rays, p, found.face[q], found.part[q])
                 total[p, 0] += share * red
                 total[p, 1] += share * green
                 total[p, 2] += share * blue
@@ -123,7 +123,7 @@ def add_seen(total, weight, shape, appearance, rays, rows):
         scratch, n = layers_of(q, found, nodes, faces, scratch)
         r, g, b, left = 0.0, 0.0, 0.0, 1.0
         for i in range(n):
-            red, green, blue, alpha = look(shape, looks, rays, p, scratch[1][i], scratch[2][i])
+            red, green, blue, alpha = look(shape, (looks, lit), rays, p, scratch[1][i], scratch[2][i])
             part = left * alpha
             r, g, b = r + part * red, g + part * green, b + part * blue
             left *= 1 - alpha
@@ -156,21 +156,37 @@ def find_visible(shape, faces, rays, rows):
 
 
 @jit
-def look(shape, looks, rays, p, f, n):
-    """Return straight RGB and opacity of face `f` in part `n` as ray `p` sees it."""
+def look(shape, appearance, rays, p, f, n):
+    """Return straight RGB and opacity of face `f` in part `n` as ray `p` sees it; `appearance` is `Looks` and `Lit`."""
+    looks, lit = appearance
     red, green, blue, alpha = looks.rgb[f, 0], looks.rgb[f, 1], looks.rgb[f, 2], looks.opacity[f]
-    if not looks.is_textured[f]:
+    if not (looks.is_textured[f] or lit.is_lit[f]):
         return red, green, blue, alpha
-    u, v, level = texture_place(shape, looks, rays, p, f, n)
-    r, g, b, a = lookup(looks, looks.mesh_of[f], u, v, level)
-    if a > 1 - FULL:
-        a = 1.0
-    return red * r, green * g, blue * b, alpha * a
+    t = rays.t[p] if len(rays.t) > 1 else rays.t[0]
+    corners = corners_seen(shape, rays, p, f, n)
+    x, y, _ = corners
+    e0, e1, e2 = x[1] * y[2] - y[1] * x[2], x[2] * y[0] - y[2] * x[0], x[0] * y[1] - y[0] * x[1]
+    scale = e0 + e1 + e2
+    b0, b1, b2 = e0 / scale, e1 / scale, e2 / scale
+    mesh = looks.mesh_of[f]
+    if looks.is_textured[f]:
+        uv = looks.uv
+        u = b0 * uv[f, 0, 0] + b1 * uv[f, 1, 0] + b2 * uv[f, 2, 0]
+        v = b0 * uv[f, 0, 1] + b1 * uv[f, 1, 1] + b2 * uv[f, 2, 1]
+        level = 0.0
+        if looks.n_levels[mesh] > 1:
+            level = mip_level(looks, f, (e0, e1, e2), corners)
+        r, g, b, a = lookup(looks, mesh, u, v, level)
+        red, green, blue, alpha = red * r, green * g, blue * b, alpha * (1.0 if a > 1 - FULL else a)
+    if lit.is_lit[f]:
+        r, g, b = lambert.lit_by(lit, shape, (b0, b1, b2, np.sign(scale), mesh), f, t)
+        red, green, blue = red * r, green * g, blue * b
+    return red, green, blue, alpha
 
 
 @jit
-def texture_place(shape, looks, rays, p, f, n):
-    """Return u, v and the mip level where ray `p` meets face `f` in part `n`."""
+def corners_seen(shape, rays, p, f, n):
+    """Return x, y, w (3,) of the corners of face `f` in part `n` as ray `p` sees them."""
     x, y, w = np.empty(3), np.empty(3), np.empty(3)
     time = raster.part_time(shape.times[n, 0], shape.times[n, 1], rays.t[p] if len(rays.t) > 1 else rays.t[0])
     rx = rays.x_ndc[p % rays.width] if rays.is_grid else rays.x_ndc[p]
@@ -179,21 +195,19 @@ def texture_place(shape, looks, rays, p, f, n):
         vertex = shape.corner[f, i] + shape.shift[n]
         start, end = raster.corner_at(shape.clip_start, vertex), raster.corner_at(shape.clip_end, vertex)
         x[i], y[i], _, w[i] = raster.between(raster.reduced(start, rx, ry), raster.reduced(end, rx, ry), time)
-    e0, e1, e2 = x[1] * y[2] - y[1] * x[2], x[2] * y[0] - y[2] * x[0], x[0] * y[1] - y[0] * x[1]
-    scale = e0 + e1 + e2
-    b0, b1, b2 = e0 / scale, e1 / scale, e2 / scale
-    uv = looks.uv
-    u = b0 * uv[f, 0, 0] + b1 * uv[f, 1, 0] + b2 * uv[f, 2, 0]
-    v = b0 * uv[f, 0, 1] + b1 * uv[f, 1, 1] + b2 * uv[f, 2, 1]
-    mesh = looks.mesh_of[f]
-    if looks.n_levels[mesh] == 1:
-        return u, v, 0.0
+    return x, y, w
+
+
+@jit
+def mip_level(looks, f, e, corners):
+    """Return the mip level of a lookup where the edge functions are `e`."""
+    (e0, e1, e2), (x, y, w) = e, corners
+    scale, uv, mesh = e0 + e1 + e2, looks.uv, looks.mesh_of[f]
     square = 0.0
     for axis in range(2):
         c, d = (y, w) if axis == 0 else (w, x)
         d0, d1, d2 = c[1] * d[2] - d[1] * c[2], c[2] * d[0] - d[2] * c[0], c[0] * d[1] - d[0] * c[1]
-        all_of = d0 + d1 + d2
-        step = looks.step[axis] / (scale * scale)
+        all_of, step = d0 + d1 + d2, looks.step[axis] / (scale * scale)
         s0, s1, s2 = (
             (scale * d0 - e0 * all_of) * step,
             (scale * d1 - e1 * all_of) * step,
@@ -202,7 +216,7 @@ def texture_place(shape, looks, rays, p, f, n):
         for k in range(2):
             slope = looks.size[0, k, mesh] * (s0 * uv[f, 0, k] + s1 * uv[f, 1, k] + s2 * uv[f, 2, k])
             square += slope * slope
-    return u, v, min(np.log2(max(np.sqrt(0.5 * square), 1.0)), looks.n_levels[mesh] - 1.0)
+    return min(np.log2(max(np.sqrt(0.5 * square), 1.0)), looks.n_levels[mesh] - 1.0)
 
 
 @jit

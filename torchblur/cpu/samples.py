@@ -2,8 +2,8 @@
 
 Before: raster.py, layers.py, motion.py, instant.py, time_samples.py.  After: sampling.py.
 Symbols: N samples a pixel, P pixels of a block of rows; n layers. All samples of one rank in time are looked at
-together; the numbers drawn, and how a ray's time is expressed in its slice, are those of time_samples.py. Lit faces
-take the hybrid way, as in instant.py.
+together; the numbers drawn, and how a ray's time is expressed in its slice, are those of time_samples.py. What
+shadows may fall on takes the hybrid way, as in instant.py.
 Source: Akenine-Moller et al. 2007, McGuire et al. 2010.
 """
 
@@ -21,6 +21,7 @@ from torchblur import packed
 from torchblur.camera import Ray
 from torchblur.cpu import layers, raster
 from torchblur.cpu.instant import bands_of, compiles_looks, corners_of, faces_of, looks_of, on_threads
+from torchblur.cpu.lambert import find_lit
 from torchblur.cpu.motion import Knots, find_knots, vertices_at
 from torchblur.edges import cross
 from torchblur.prisms import window_times
@@ -48,6 +49,7 @@ def sum_of_samples(
     """Return what `torchblur.time_samples.sum_of_samples` does. Source: as there."""
     camera = scene.camera
     knots, corner, faces = find_knots(scene), corners_of(scene), faces_of(surfaces)
+    lit = find_lit(scene, surfaces)
     together = max(1, MAX_VERTICES // max(1, int(knots.mesh[:, 1].sum())))
     parts = []
     for block in blocks_of_rows(scene, shutter, count, draw):
@@ -62,7 +64,7 @@ def sum_of_samples(
 
                 def add(rows: tuple[int, int], ranks=ranks, looks=looks, total=total) -> None:
                     for rank in ranks:
-                        layers.add_seen(total, rank.weight, rank.shape, (faces, looks), rank.rays, rows)
+                        layers.add_seen(total, rank.weight, rank.shape, (faces, looks, lit), rank.rays, rows)
 
                 on_threads(add, bands_of(n_rows))
                 continue

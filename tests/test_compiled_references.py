@@ -21,6 +21,7 @@ from random_scenes import Recipe, build, build_shutter, recipes
 
 import torchblur as tb
 from torchblur.backends import choose_backend
+from torchblur.cpu import jit
 
 N_EXAMPLES = max(60, settings().max_examples)
 ROUNDING = {torch.float64: 1e-12, torch.float32: 2.0**-22}
@@ -156,6 +157,37 @@ def test_threads_change_nothing():
         torch.set_num_threads(before)
     assert len(found) == 2
     assert all(torch.equal(image, one) for image in found)
+
+
+class Images(torch.utils.data.Dataset):
+    """Sharp images of a scene, made by whoever asks."""
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, k):
+        return tb.render_instant(make.to_torch(agreement_scenes.SCENES["opaque"]()), 0.4, backend="cpu").rgba
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_of_a_loader_after_use_in_the_parent(start):
+    own = Images()[0]
+    loader = torch.utils.data.DataLoader(Images(), batch_size=None, num_workers=1, multiprocessing_context=start)
+    images = list(loader)
+    assert len(images) == 3
+    assert all(torch.equal(image, own) for image in images)
+
+
+def test_compiled_code_of_other_sources_is_forgotten(tmp_path):
+    source, store = tmp_path / "one.py", tmp_path / "__pycache__"
+    source.write_text("x = 1")
+    jit.forget_other_sources(tmp_path)
+    (store / "one.nbi").write_text("compiled")
+    jit.forget_other_sources(tmp_path)
+    assert (store / "one.nbi").exists()
+    source.write_text("x = 2")
+    jit.forget_other_sources(tmp_path)
+    assert not (store / "one.nbi").exists()
 
 
 def test_which_backend_is_chosen():

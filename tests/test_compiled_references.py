@@ -21,7 +21,7 @@ from random_scenes import Recipe, build, build_shutter, recipes
 
 import torchblur as tb
 from torchblur.backends import choose_backend
-from torchblur.cpu import jit
+from torchblur.cpu import jit, shadow_rays
 
 N_EXAMPLES = max(60, settings().max_examples)
 ROUNDING = {torch.float64: 1e-12, torch.float32: 2.0**-22}
@@ -56,10 +56,12 @@ def test_scenes_that_differ_in_everything(name, dtype):
     compare(make.to_torch(agreement_scenes.SCENES[name](), dtype), rays=2)
 
 
-@pytest.mark.parametrize("casts_shadows", [False, True], ids=["plain", "shadows"])
+@pytest.mark.parametrize("way", ["plain", "shadows", "hybrid"])
 @pytest.mark.parametrize("name", lit_scenes.SCENES)
-def test_lit_scenes_compiled_or_with_shadows_in_the_hybrid_way(name, casts_shadows):
-    compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=casts_shadows))
+def test_lit_scenes_with_shadows_of_few_casters_and_of_many(name, way, monkeypatch):
+    if way == "hybrid":
+        monkeypatch.setattr(shadow_rays, "MOST", 0)
+    compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=way != "plain"))
 
 
 @pytest.mark.parametrize("direction", ["down", "up", "right", "left"])
@@ -70,7 +72,8 @@ def test_rolling_shutters(direction):
 
 def check(recipe: Recipe) -> None:
     plain, shutter = build(recipe), build_shutter(recipe)
-    scene = lit_scenes.to_torch(plain, torch.float64 if recipe.is_double else torch.float32)
+    dtype = torch.float64 if recipe.is_double else torch.float32
+    scene = lit_scenes.to_torch(plain, dtype, casts_shadows=recipe.seed % 2 == 0)
     real = tb.Shutter(shutter.times, shutter.weights, shutter.line_delay, shutter.direction)
     compare(scene, real, recipe.n_rays)
 

@@ -58,6 +58,7 @@ TORCHBLUR = [
     "cpu.jit",
     "cpu.motion",
     "cpu.raster",
+    "cpu.shadow_rays",
     "cpu.lambert",
     "cpu.layers",
     "cpu.instant",

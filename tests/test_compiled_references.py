@@ -213,6 +213,9 @@ def test_gradients_are_those_of_torch():
         assert torch.autograd.grad(image.sum(), color)[0].abs().min() > 0
         with pytest.raises(ValueError, match="backend: expected torch or auto for a scene that asks for gradients"):
             make_image(scene, 2, backend="cpu")
+        with torch.no_grad():  # then there is nothing to differentiate, whatever the tensors ask for
+            assert choose_backend(scene, "auto") == "cpu"
+            torch.testing.assert_close(make_image(scene, 2).rgba, image.detach(), rtol=0, atol=1e-6)
 
 
 def test_recipes_reach_what_the_compiled_code_tells_apart():

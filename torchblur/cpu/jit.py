@@ -6,10 +6,22 @@ Source: ours.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numba
+
+
+def _digest() -> str:
+    """Return a digest of all that may be compiled into a function: its folder, and the constants it takes from ours."""
+    here = Path(__file__).resolve().parent
+    texts = [path.read_bytes() for path in sorted([*here.glob("*.py"), *here.parent.glob("*.py")])]
+    return hashlib.sha256(b"\0".join(texts)).hexdigest()
+
+
+DIGEST = _digest()
 
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -19,6 +31,10 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to store it in
         return numba.njit(**options)(function)
+    # Numba asks only whether the function's own file has changed, not those of the functions that it calls
+    stored = compiled._cache._cache_file
+    stored._source_stamp = (stored._source_stamp, DIGEST)
+    return compiled

@@ -21,7 +21,7 @@ from random_scenes import Recipe, build, build_shutter, recipes
 
 import torchblur as tb
 from torchblur.backends import choose_backend
-from torchblur.cpu import jit, shadow_rays
+from torchblur.cpu import shadow_rays
 
 N_EXAMPLES = max(60, settings().max_examples)
 ROUNDING = {torch.float64: 1e-12, torch.float32: 2.0**-22}
@@ -179,18 +179,6 @@ def test_workers_of_a_loader_after_use_in_the_parent(start):
     images = list(loader)
     assert len(images) == 3
     assert all(torch.equal(image, own) for image in images)
-
-
-def test_compiled_code_of_other_sources_is_forgotten(tmp_path):
-    source, store = tmp_path / "one.py", tmp_path / "__pycache__"
-    source.write_text("x = 1")
-    jit.forget_other_sources(tmp_path)
-    (store / "one.nbi").write_text("compiled")
-    jit.forget_other_sources(tmp_path)
-    assert (store / "one.nbi").exists()
-    source.write_text("x = 2")
-    jit.forget_other_sources(tmp_path)
-    assert not (store / "one.nbi").exists()
 
 
 def test_which_backend_is_chosen():

@@ -67,7 +67,14 @@ TORCHBLUR = [
     "cpu.samples",
     "sampling",
     "metrics",
+    "cpu.polynomials",
+    "cpu.coverage",
+    "cpu.sweep",
+    "cpu.tiles",
+    "cpu.blend",
+    "cpu.visibility",
     "ledger",
+    "exposure",
     "render",
 ]
 DOORS = {  # third-party package: the only files that may import it (stems; "*" = all of the package)
@@ -93,6 +100,7 @@ MAX_PARAMETERS = 6
 MORE_PARAMETERS = {
     "look_at": "the field's own signature for a camera",
     "orthographic": "the twin of look_at",
+    "render": "all keywords but the first",
     "render_windows": "as render, and the windows",
     "accumulate": "what random draws, and how they are looked at",
 }

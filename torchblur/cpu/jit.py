@@ -6,7 +6,6 @@ Source: ours.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,15 @@ from typing import Any
 
 import numba
 
-SOURCES_NAME = "compiled_sources.sha256"
+
+def _digest() -> str:
+    """Return a digest of all that may be compiled into a function: its folder, and the constants it takes from ours."""
+    here = Path(__file__).resolve().parent
+    texts = [path.read_bytes() for path in sorted([*here.glob("*.py"), *here.parent.glob("*.py")])]
+    return hashlib.sha256(b"\0".join(texts)).hexdigest()
+
+
+DIGEST = _digest()
 
 
 def jit(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -24,26 +31,10 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     options = {"nogil": True, "error_model": "numpy"}
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to store it in
         return numba.njit(**options)(function)
-
-
-def forget_other_sources(folder: Path) -> None:
-    """Delete the compiled code stored beside the sources of `folder` that was made of other sources than these.
-
-    Numba looks only at the file of a function itself, not at those of the functions compiled into it. Source: ours.
-    """
-    found = hashlib.sha256(b"".join(path.read_bytes() for path in sorted(folder.glob("*.py")))).hexdigest()
-    store = folder / "__pycache__"
-    known = store / SOURCES_NAME
-    with contextlib.suppress(OSError):  # read-only, or another process was faster
-        if known.exists() and known.read_text(encoding="utf-8") == found:
-            return
-        for index in store.glob("*.nbi"):
-            index.unlink()
-        store.mkdir(exist_ok=True)
-        known.write_text(found, encoding="utf-8")
-
-
-forget_other_sources(Path(__file__).parent)
+    # Numba asks only whether the function's own file has changed, not those of the functions that it calls
+    stored = compiled._cache._cache_file
+    stored._source_stamp = (stored._source_stamp, DIGEST)
+    return compiled

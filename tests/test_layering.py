@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TORCHBLUR = [
     "check",
     "packed",
+    "cpu.jit",
     "shutter",
     "accuracy",
     "bernstein",
@@ -45,6 +46,7 @@ TORCHBLUR = [
     "lighting",
     "shading",
     "blocking",
+    "cpu.sieve",
     "shadow_pairs",
     "shadows",
     "averages",
@@ -55,7 +57,6 @@ TORCHBLUR = [
     "nodes",
     "resolve",
     "fragments",
-    "cpu.jit",
     "cpu.motion",
     "cpu.raster",
     "cpu.shadow_rays",

@@ -54,13 +54,13 @@ def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Ite
         for pairs in _join(receiver, caster, receivers, casters):
             kept.append(pairs)
             if sum(len(r) for r, _ in kept) >= AT_ONCE:
-                yield _together(kept)
+                yield together(kept)
                 kept = []
     if kept:
-        yield _together(kept)
+        yield together(kept)
 
 
-def _together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
+def together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
     """Return pairs end to end."""
     r, c = (torch.cat(p) for p in zip(*parts, strict=True))
     return r, c

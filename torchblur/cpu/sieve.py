@@ -1,0 +1,294 @@
+"""Which pairs of receivers and casters may block a light at all, compiled: most candidates do not.
+
+Before: jit.py, blocking.py.  After: shadows.py.
+Symbols: as in blocking.py, whose tests these are in the same arithmetic: a pair is left out only where the Bernstein
+coefficients show, on every slice that is looked at, that no time has all signs alike.
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchblur.blocking import HALVINGS, NOISE, Receivers
+from torchblur.casters import Casters
+from torchblur.cpu.jit import jit
+from torchblur.lights import DirectionalLight, Light, along
+
+ROOM = 16.0  # times the rounding that blocking.py allows for: what is left out there is left out, nothing else
+MANY = 1 << 16  # pairs; fewer are not worth loading compiled code
+FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
+FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
+
+
+def sift(light: Light, receivers: Receivers, casters: Casters, pairs: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Return those of the pairs, receiver and caster (n,) that share some time, that may block the light.
+
+    Source: ours.
+    """
+    receiver, caster = pairs
+    is_directional = isinstance(light, DirectionalLight)
+    shines = light.direction if is_directional else light.position
+    start = torch.maximum(receivers.t[0, receiver], casters.t_open[caster])
+    end = torch.minimum(receivers.t[1, receiver], casters.t_close[caster])
+    ends = torch.stack([along(shines, start), along(shines, end)]).permute(2, 0, 1).contiguous()
+    thing = [a.contiguous().numpy() for a in (receivers.place.permute(2, 0, 1), receivers.scale.T, receivers.t.T)]
+    caster_t = torch.stack([casters.t_open, casters.t_close], dim=1)
+    blocker = casters.world.permute(3, 0, 1, 2).contiguous().numpy(), caster_t.numpy(), casters.gap
+    may = _sift(receiver.numpy(), caster.numpy(), tuple(thing), blocker, (ends.numpy(), is_directional))
+    chosen = torch.from_numpy(may).nonzero().flatten()
+    return receiver[chosen], caster[chosen]
+
+
+@jit
+def _sift(receiver, caster, thing, blocker, light):
+    """Return (n,) whether each pair may block."""
+    place, scale, times = thing
+    world, slices, gap = blocker
+    ends, is_directional = light
+    n = len(receiver)
+    may = np.ones(n, dtype=np.bool_)
+    p, s = np.empty((4, 3)), np.empty(3)
+    corner, lamp = np.empty((2, 3, 3)), np.empty((2, 3))
+    signs, room = np.empty((HALVINGS + 1, 5, 6)), np.empty(5)
+    scratch = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3))
+    is_instant = place.shape[1] == 1
+    for k in range(n):
+        r, c = receiver[k], caster[k]
+        t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
+        if is_instant:
+            p[:] = place[r, 0]
+            s[:] = scale[r, 0]
+        else:
+            p[:] = place[r]
+            s[:] = scale[r]
+            length = times[r, 1] - times[r, 0]
+            u_start = (t_start - times[r, 0]) / length
+            u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
+            if u_start > 0 or u_end < 1:
+                for d in range(3):
+                    _restrict(p[:, d], u_start, u_end)
+                _restrict(s, u_start, u_end)
+        for e in range(2):
+            t = t_end if e == 1 and not is_instant else t_start
+            u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
+            for i in range(3):
+                for d in range(3):
+                    corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
+        lamp[:] = ends[k]
+        if is_directional:
+            n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], room))
+        else:
+            n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], room))
+        may[k] = _may_be_alike(signs, room, n_signs, 0 if is_instant else HALVINGS)
+    return may
+
+
+@jit
+def _restrict(c, start, end):
+    """Turn Bernstein coefficients (n,) into those on [start, end]."""
+    n = len(c)
+    for m in range(n - 1, 0, -1):  # the part before `end`
+        for i in range(n - 1, n - 1 - m, -1):
+            c[i] = (1 - end) * c[i - 1] + end * c[i]
+    share = start / end
+    for m in range(n - 1, 0, -1):  # and of it the part after `start`
+        for i in range(m):
+            c[i] = (1 - share) * c[i] + share * c[i + 1]
+
+
+@jit
+def _cross_linear(a0, a1, b0, b1, out):
+    """Write the coefficients (3, 3) of the cross product of linear vectors to `out`."""
+    for d in range(3):
+        i, j = FIRST[d], SECOND[d]
+        out[0, d] = a0[i] * b0[j] - a0[j] * b0[i]
+        out[1, d] = 0.5 * ((a0[i] * b1[j] - a0[j] * b1[i]) + (a1[i] * b0[j] - a1[j] * b0[i]))
+        out[2, d] = a1[i] * b1[j] - a1[j] * b1[i]
+
+
+@jit
+def _add_dot_2_3(a, b, sign, out):
+    """Add the dot products of vectors of degree 2, (3, 3), and 3, (4, 3), to `out` (6,), `sign` times."""
+    for i in range(3):
+        for j in range(4):
+            dot = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
+            out[i + j] += sign * FIVE_OF_2_3[i, i + j] * dot
+
+
+@jit
+def _add_2_3(a, b, sign, out):
+    """Add the product of polynomials of degree 2, (3,), and 3, (4,), to `out` (6,), `sign` times."""
+    for i in range(3):
+        for j in range(4):
+            out[i + j] += sign * FIVE_OF_2_3[i, i + j] * a[i] * b[j]
+
+
+@jit
+def _dot_2_1(a, b0, b1, out):
+    """Write the dot product of vectors of degree 2, (3, 3), and 1 to `out` (4,)."""
+    out[:] = 0.0
+    for i in range(3):
+        first = a[i, 0] * b0[0] + a[i, 1] * b0[1] + a[i, 2] * b0[2]
+        last = a[i, 0] * b1[0] + a[i, 1] * b1[1] + a[i, 2] * b1[2]
+        out[i] += first * (3 - i) / 3
+        out[i + 1] += last * (i + 1) / 3
+
+
+@jit
+def _largest(values):
+    """Return the greatest absolute value of an array of any shape."""
+    out = 0.0
+    for v in values.flat:
+        out = max(out, abs(v))
+    return out
+
+
+@jit
+def _from_position(corner, lamp, point, scratch, out):
+    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many they are."""
+    p, s, gap = point
+    normal, vector, _ = scratch
+    signs, room = out
+    scale, away = (s[0] + s[1] + s[2]) / 3, 0.0
+    for d in range(3):
+        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
+    away = gap * max(_largest(corner), away / scale)
+    reach = _largest(p) + max(s[0], s[1], s[2]) * _largest(lamp)
+    square = 0.0
+    for d in range(3):
+        vector[0, d] = p[0, d] - s[0] * lamp[0, d]
+        vector[1, d] = p[1, d] - (s[0] * lamp[1, d] + 2 * s[1] * lamp[0, d]) / 3
+        vector[2, d] = p[2, d] - (2 * s[1] * lamp[1, d] + s[2] * lamp[0, d]) / 3
+        vector[3, d] = p[3, d] - s[2] * lamp[1, d]
+        square += ((vector[0, d] + vector[1, d] + vector[2, d] + vector[3, d]) / 4) ** 2
+        for i in range(3):
+            corner[0, i, d] -= lamp[0, d]
+            corner[1, i, d] -= lamp[1, d]
+    size0, size1, size2 = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
+    sizes = size0 * size1, size1 * size2, size2 * size0
+    signs[:] = 0.0
+    volume = vector[:, 0].copy()
+    for e in range(3):
+        i, j = e, FIRST[e]
+        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
+        _add_dot_2_3(normal, vector, 1.0, signs[e])
+        if e == 1:
+            _dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
+        room[e] = ROOM * NOISE * reach * sizes[e]
+    distance = np.sqrt(square) / scale
+    bias = min(away / distance, 1.0) if distance > 0 else 1.0
+    for k in range(6):
+        signs[4, k] = (1 - bias) * (signs[0, k] + signs[1, k] + signs[2, k])
+    _add_2_3(s, volume, -1.0, signs[4])
+    signs[3, 0], signs[3, 5] = volume[0], volume[3]  # degree 3 as degree 5
+    signs[3, 1] = 0.4 * volume[0] + 0.6 * volume[1]
+    signs[3, 2] = 0.1 * volume[0] + 0.6 * volume[1] + 0.3 * volume[2]
+    signs[3, 3] = 0.3 * volume[1] + 0.6 * volume[2] + 0.1 * volume[3]
+    signs[3, 4] = 0.6 * volume[2] + 0.4 * volume[3]
+    room[3] = ROOM * NOISE * size0 * size1 * size2
+    room[4] = room[0] + room[1] + room[2] + max(s[0], s[1], s[2]) * room[3]
+    return 5
+
+
+@jit
+def _along_direction(corner, way, point, scratch, out):
+    """Write the polynomials of a direction, and their rounding, to `out`; return how many they are."""
+    p, s, gap = point
+    normal, vector, side = scratch
+    signs, room = out
+    scale, away, square, span = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0, 0.0
+    for d in range(3):
+        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
+        square += (0.5 * (way[0, d] + way[1, d])) ** 2
+    away = gap * max(_largest(corner), away / scale)
+    reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
+    size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
+    signs[:] = 0.0
+    constant = vector[:, 0].copy()
+    for e in range(3):
+        i, j = e, FIRST[e]
+        for a in range(2):
+            for d in range(3):
+                side[a, d] = corner[a, j, d] - corner[a, i, d]
+                span = max(span, abs(side[a, d]))
+        _cross_linear(way[0], way[1], side[0], side[1], normal)
+        _add_dot_2_3(normal, p, 1.0, signs[e])
+        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
+        _dot_2_1(normal, way[0], way[1], constant)
+        _add_2_3(s, constant, 1.0, signs[e])
+        room[e] = ROOM * NOISE * speed * (reach * (size[i] + size[j]) + largest * size[i] * size[j])
+    first, second = np.empty((2, 3)), np.empty((2, 3))
+    for d in range(3):
+        for a in range(2):
+            first[a, d], second[a, d] = corner[a, 1, d] - corner[a, 0, d], corner[a, 2, d] - corner[a, 0, d]
+        vector[0, d] = p[0, d] - s[0] * corner[0, 0, d]
+        vector[1, d] = p[1, d] - (s[0] * corner[1, 0, d] + 2 * s[1] * corner[0, 0, d]) / 3
+        vector[2, d] = p[2, d] - (2 * s[1] * corner[1, 0, d] + s[2] * corner[0, 0, d]) / 3
+        vector[3, d] = p[3, d] - s[2] * corner[1, 0, d]
+    _cross_linear(first[0], first[1], second[0], second[1], normal)
+    _add_dot_2_3(normal, vector, 1.0, signs[3])
+    _dot_2_1(normal, way[0], way[1], constant)
+    length = np.sqrt(square)
+    _add_2_3(s, constant, -away / (length if length > 0 else 1.0), signs[3])
+    room[3] = ROOM * NOISE * span * span * (reach + largest * size[0])
+    return 4
+
+
+@jit
+def _may_be_alike(signs, room, n_signs, n_halvings):
+    """Return whether coefficients `signs` (halvings + 1, 5, 6), of which the first are given, may have one sign at some
+    time, to `room` (5,).
+    """
+    part = np.zeros(n_halvings + 1, dtype=np.int64)  # which half of each level is looked at; 2 when both are done
+    depth = 0
+    while True:
+        can_be_up, can_be_down = True, True
+        surely_up, surely_down = True, True
+        for q in range(n_signs):
+            low, high = signs[depth, q, 0], signs[depth, q, 0]
+            for k in range(1, 6):
+                low, high = min(low, signs[depth, q, k]), max(high, signs[depth, q, k])
+            can_be_up &= high >= -room[q]
+            can_be_down &= low <= room[q]
+            surely_up &= low > room[q]
+            surely_down &= high < -room[q]
+        if surely_up or surely_down:
+            return True
+        if can_be_up or can_be_down:
+            if depth == n_halvings:
+                return True
+            _halve(signs, depth, n_signs)
+            depth += 1
+            part[depth] = 0
+            continue
+        while depth > 0 and part[depth] == 1:
+            depth -= 1
+        if depth == 0:
+            return False
+        part[depth] = 1
+        _second_half(signs, depth, n_signs)
+
+
+@jit
+def _halve(signs, depth, n_signs):
+    """Write the coefficients on the first half of level `depth` to the next."""
+    for q in range(n_signs):
+        for k in range(6):
+            signs[depth + 1, q, k] = signs[depth, q, k]
+        for m in range(5):
+            for k in range(5, m, -1):
+                signs[depth + 1, q, k] = 0.5 * (signs[depth + 1, q, k - 1] + signs[depth + 1, q, k])
+
+
+@jit
+def _second_half(signs, depth, n_signs):
+    """Write the coefficients on the second half of the level before `depth` to it."""
+    for q in range(n_signs):
+        for k in range(6):
+            signs[depth, q, k] = signs[depth - 1, q, k]
+        for m in range(5, 0, -1):
+            for k in range(m):
+                signs[depth, q, k] = 0.5 * (signs[depth, q, k] + signs[depth, q, k + 1])

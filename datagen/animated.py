@@ -27,7 +27,7 @@ GLTF_SUFFIXES = (".gltf", ".glb")
 ANIMATED_SUFFIXES = (*GLTF_SUFFIXES, *USD_SUFFIXES)
 EVEN_PROBES = 33  # instants at which an animation is measured, beside its keys
 KEY_PROBES = 64  # at most that many keys
-AT_ONCE = 4  # of these; bounds the memory
+AT_ONCE = 1_000_000  # vertices of all instants that are held at a time; bounds the memory at about 100 MB
 SAME_POSE = 1e-3  # share of the radius by which the last pose may differ from the first in a round
 MAX_KINKS = 64  # in one exposure; beyond it no number of segments would follow them
 SHORTEST_S = 1e-3  # a shorter animation stands still: it would play faster than any shutter
@@ -252,17 +252,25 @@ def measure(path: Path, name: str, pose: Pose, faces: Tensor) -> Action:
     keys = pose.keys_s
     even = torch.linspace(float(keys[0]), float(keys[-1]), EVEN_PROBES, dtype=torch.float64)
     times = torch.cat([even, keys[:: -(-len(keys) // KEY_PROBES)]]).unique()
+    blocks = times.split(max(1, AT_ONCE // pose.at(times[:1]).shape[1]))
     corners = []
-    for block in times.split(AT_ONCE):
+    for block in blocks:
         positions = pose.at(block)
         check_geometry(path, positions.reshape(-1, 3).numpy(), faces.numpy(), positions.shape[1])
         corners += [positions.amin((0, 1)), positions.amax((0, 1))]
-    centre = (torch.stack(corners).amin(0) + torch.stack(corners).amax(0)) / 2
-    radius = max(float((pose.at(block) - centre).norm(dim=-1).max()) for block in times.split(AT_ONCE))
-    if not radius > SMALLEST_EXTENT:
-        raise MeshError(path, f"vertices: expected some extent, got a radius of {radius:g}")
-    if not any(has_area(((pose.at(time)[0] - centre) / radius)[faces]) for time in times.split(1)):
+    low, high = torch.stack(corners).amin(0), torch.stack(corners).amax(0)
+    centre, half = (low + high) / 2, float((high - low).norm()) / 2
+    if not half > SMALLEST_EXTENT:
+        raise MeshError(path, f"vertices: expected some extent, got a radius of {half:g}")
+    radius, is_flat, first, last = 0.0, True, None, None
+    for block in blocks:
+        positions = pose.at(block) - centre
+        radius = max(radius, float(positions.norm(dim=-1).max()))
+        is_flat = is_flat and not any(has_area((frame / half)[faces]) for frame in positions)
+        first, last = positions[0] if first is None else first, positions[-1]
+    if is_flat:
         raise MeshError(path, "faces: expected a triangle with an area, got none")
-    first, last = pose.at(times[:1])[0], pose.at(times[-1:])[0]
+    assert first is not None
+    assert last is not None
     is_round = float((first - last).norm(dim=-1).max()) <= SAME_POSE * radius
     return Action(name, pose, centre, radius, is_round)

@@ -21,6 +21,7 @@ from datagen.gltf_takes import n_targets, read_takes, unit_quaternion
 from datagen.rigs import Node, Part, Rig, Skin, Take
 
 MAX_NODES = 4096
+MAX_WORK = 100_000_000  # of all animations, as `Rig.work`: each is measured at some 100 instants, twice
 TRIANGLES, STRIP, FAN = 4, 5, 6
 NO_LOOK = np.array([[0.45, 0.45, 0.45, 1.0]])  # linear; of parts without a colour beside parts that have one
 
@@ -73,6 +74,9 @@ def read_rig(file: GltfFile) -> RigFile:
     if not parts or not sum(map(len, faces)):
         raise file.fail("expected triangles, got none")
     rig = Rig(nodes, order, tuple(parts))
+    if sum(rig.work + 2_000 * len(take.curves) for take in takes) > MAX_WORK:
+        size = f"{len(nodes)} nodes, {rig.n_vertices} vertices and {len(takes)} animations"
+        raise file.fail(f"expected nodes, vertices with their joints and targets, and animations in bounds, got {size}")
     rgba = None
     if any(look is not None for look in looks):
         filled = [NO_LOOK.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)]

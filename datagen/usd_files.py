@@ -37,7 +37,7 @@ MAX_LAYERS = 64
 MAX_SAMPLES = 100_000  # times of all attributes together
 MAX_USD_VALUE = 1e6  # of a coordinate, as for all meshes
 VET_TIMES = 33  # instants at which a file is tried
-VET_SECONDS = 120
+VET_SECONDS = 60
 VET_BYTES = 2 * 2**30  # of address space
 
 

@@ -337,6 +337,14 @@ def test_scales_that_multiply_beyond_bounds_are_refused(tmp_path):
         load_animated(maker.save(tmp_path / "a.gltf"))
 
 
+def test_files_whose_animations_would_take_minutes_are_refused(tmp_path):
+    maker = bender()
+    maker.tree["nodes"] += [{}] * 4000
+    maker.tree["animations"] = maker.tree["animations"] * 200
+    with pytest.raises(MeshError, match="in bounds, got 4003 nodes, 10 vertices and 200 animations"):
+        load_animated(maker.save(tmp_path / "a.gltf"))
+
+
 def test_nothing_outside_the_folder_is_read(tmp_path):
     (tmp_path / "above.bin").write_bytes(b"\0" * 4096)
     (tmp_path / "in").mkdir()

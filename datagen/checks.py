@@ -18,7 +18,7 @@ from datagen.folders import RUN_NAME, encode_run, read_run, record_sum
 from datagen.listed_files import file_damage, is_of_configuration
 from datagen.manifest import MANIFEST_NAME, encode_entry, scan_manifest
 from datagen.shards import marker_entries, marker_path, scan_shards, shard_damage
-from datagen.spec import DatasetSpec, SpecError, parse_spec
+from datagen.spec import DatasetSpec, SpecError, recorded_spec
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def verify_dataset(folder: str | Path) -> list[str]:
         run = read_run(folder)
         if record_sum(run) != run.get("record_sha256") or encode_run(run) != (folder / RUN_NAME).read_bytes():
             problems.append(f"{RUN_NAME}: expected a record with its checksum, got another")
-        spec, config = parse_spec(run["spec"]), run["config_sha256"]
+        spec, config = recorded_spec(run["spec"]), run["config_sha256"]
     except (SpecError, KeyError) as error:
         problems.append(f"{RUN_NAME}: expected the record of a run, got one that is missing or damaged ({error})")
         spec, config = None, None
@@ -90,7 +90,7 @@ def read_status(folder: str | Path) -> Status:
     Source: ours.
     """
     folder = Path(folder)
-    spec, entries = parse_spec(read_run(folder)["spec"]), read_entries(folder)
+    spec, entries = recorded_spec(read_run(folder)["spec"]), read_entries(folder)
     failed: dict[int, str] = {}
     refused: dict[str, str] = {}
     for place in sorted(folder.glob("failures*.json")):

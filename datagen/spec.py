@@ -102,7 +102,7 @@ class DatasetSpec(BaseModel):
     @field_validator("textures", "backgrounds")
     @classmethod
     def _picture_folders_exist(cls, text: str | None, info: ValidationInfo) -> str | None:
-        if text is not None and not Path(text).is_dir():
+        if text is not None and not _is_recorded(info) and not Path(text).is_dir():
             raise ValueError(f"{info.field_name}: expected a folder of pictures, got {text!r}, which is no folder")
         return text
 
@@ -117,8 +117,8 @@ class DatasetSpec(BaseModel):
         return text
 
     @model_validator(mode="after")
-    def _assets_fit_the_source(self) -> DatasetSpec:
-        problem = assets_problem(self.source, self.assets)
+    def _assets_fit_the_source(self, info: ValidationInfo) -> DatasetSpec:
+        problem = "" if _is_recorded(info) else assets_problem(self.source, self.assets)
         if problem:
             raise ValueError(problem)
         return self
@@ -209,6 +209,20 @@ def parse_spec(fields: dict[str, Any]) -> DatasetSpec:
         raise SpecError(problems) from None
 
 
+def recorded_spec(fields: dict[str, Any]) -> DatasetSpec:
+    """Return the specification of a data set that is there, whose assets and pictures may be elsewhere by now.
+
+    Raises:
+        SpecError: any number of wrong fields, all listed.
+
+    Source: ours.
+    """
+    try:
+        return DatasetSpec.model_validate(fields, context={"is_recorded": True})
+    except ValidationError as error:
+        raise SpecError([_problem_text(e) for e in error.errors(include_url=False)]) from None
+
+
 def read_spec_fields(path: str | Path) -> dict[str, Any]:
     """Return the fields in a TOML file, not yet checked.
 
@@ -221,6 +235,11 @@ def read_spec_fields(path: str | Path) -> dict[str, Any]:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise SpecError([f"config: expected a readable TOML file, got {str(path)!r}: {error}"]) from None
+
+
+def _is_recorded(info: ValidationInfo) -> bool:
+    """Tell whether a specification is read from a data set that is there."""
+    return bool((info.context or {}).get("is_recorded"))
 
 
 def _problem_text(error: Any) -> str:

@@ -2,6 +2,7 @@ import hashlib
 import io
 import json
 import random
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -265,6 +266,35 @@ def test_meshes_wear_pictures_too(pictures, tmp_path):
     assert any(name.startswith("box.ply") for names in worn for name in names)
     result = generate(parse_spec(TINY | fields), tmp_path / "data")
     assert result.is_complete
+
+
+@pytest.mark.parametrize("storage", ["folder", "shards"])
+def test_a_data_set_needs_its_assets_and_pictures_only_to_be_made(tmp_path, pictures, storage, capsys):
+    for name in ("assets", "worn", "behind"):
+        (tmp_path / name).mkdir()
+        shutil.copy(pictures / "a.png", tmp_path / name)
+    square = "v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n"
+    (tmp_path / "assets/a.obj").write_text(square)
+    fields = {"source": "meshes", "assets": str(tmp_path / "assets"), "storage": storage}
+    fields |= {"textures": str(tmp_path / "worn"), "backgrounds": str(tmp_path / "behind")}
+    folder = tmp_path / "data"
+    assert generate(parse_spec(TINY | fields), folder).is_complete
+    for name in ("assets", "worn", "behind"):
+        shutil.rmtree(tmp_path / name)
+    assert verify_dataset(folder) == []
+    for words in (
+        ["status"],
+        ["verify"],
+        ["report"],
+        ["inspect", "--frame", "1"],
+        ["export", str(tmp_path / "out"), "gopro"],
+    ):
+        assert main([words[0], str(folder), *words[1:]]) == 0
+    assert len(BlurDataset(folder)) == 3
+    capsys.readouterr()
+    assert main(["retry", str(folder)]) == 2  # to make frames, they are needed
+    told = capsys.readouterr().err
+    assert all(f"{name}: expected" in told for name in ("textures", "backgrounds", "assets"))
 
 
 def test_the_decoder_takes_bytes_only_of_its_formats():

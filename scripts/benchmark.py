@@ -75,7 +75,7 @@ def seconds(function) -> tuple[float, object]:
 
 def compare(name: str, scene: tb.Scene) -> str:
     """Return a table row: the exact frame, and averages of N sharp images beside it."""
-    exact_s, frame = seconds(lambda: tb.render(scene))
+    exact_s, frame = seconds(lambda: tb.render(scene, backend="torch"))
     cells = []
     for n in AVERAGES:
         average_s, average = seconds(lambda n=n: tb.accumulate(scene, n, backend="torch"))

@@ -114,6 +114,18 @@ def test_coplanar_faces_have_one_order_whatever_the_order_of_input(opacity):
     assert float(first[..., 3].max()) == pytest.approx(1 - (1 - opacity) ** 4)
 
 
+def test_coplanar_faces_before_and_behind_others():
+    corners = np.array([(-0.9, -0.8, 0.0), (0.9, -0.7, 0.0), (0.0, 0.9, 0.0)])
+    for seed in range(6):
+        generator = np.random.default_rng(seed)
+        depths = generator.permutation([0.5, 0.5, 0.5, 0.0, -0.5, -0.5, -0.5, -0.7])
+        scene = resting(*(corners + np.array([0, 0, z]) for z in depths), opacity=0.4)
+        compare(scene)
+        again = tb.Scene(scene.meshes[::-1], scene.camera)
+        first, second = (tb.accumulate(s, 1, backend="cpu").rgba for s in (scene, again))
+        torch.testing.assert_close(first, second, rtol=0, atol=1e-12)
+
+
 def test_opaque_faces_hide_within_half_transparent_coplanar_ones():
     corners = [(-0.9, -0.8, 0), (0.9, -0.7, 0), (0.0, 0.9, 0)]
     for seed in range(6):

@@ -82,22 +82,17 @@ def layers_of(q, found, nodes, faces, scratch):
             j -= 1
         near[j + 1], face[j + 1], part[j + 1] = a, f, m
     first = 0  # of a run of coplanar layers
-    for i in range(1, n):
-        if not np.abs(near[i] - near[i - 1]) <= TIE * np.abs(near[i]):
-            first = i
-    if first < n - 1:
-        first = 0
-        for i in range(1, n + 1):
-            if i < n and np.abs(near[i] - near[i - 1]) <= TIE * np.abs(near[i]):
-                continue
-            for k in range(first + 1, i):  # by rank
-                f, m = face[k], part[k]
-                j = k - 1
-                while j >= first and faces.rank[face[j]] > faces.rank[f]:
-                    face[j + 1], part[j + 1] = face[j], part[j]
-                    j -= 1
-                face[j + 1], part[j + 1] = f, m
-            first = i
+    for i in range(1, n + 1):
+        if i < n and np.abs(near[i] - near[i - 1]) <= TIE * np.abs(near[i]):
+            continue
+        for k in range(first + 1, i):  # by rank
+            f, m = face[k], part[k]
+            j = k - 1
+            while j >= first and faces.rank[face[j]] > faces.rank[f]:
+                face[j + 1], part[j + 1] = face[j], part[j]
+                j -= 1
+            face[j + 1], part[j + 1] = f, m
+        first = i
     return (near, face, part), n
 
 

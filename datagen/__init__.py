@@ -1,9 +1,10 @@
 """datagen: specifications and people's meshes turned into training data with exact motion blur.
 
 Files, each importing only from those before it: seeds, spec, colour, motions, knots, clips, formats, assets,
-sequences, shapes, patterns, stages, casts, scenes, baselines/, samples, sensor, pictures, writer, folders,
-listed_files, manifest, shards, entries, executors, progress, dataset, report, runs, checks, flow_files, layouts,
-picture_store, export, pages, commands, __main__.
+sequences, keyframes, rigs, gltf, gltf_looks, gltf_takes, gltf_rigs, usd_files, animated, rosters, shapes, patterns,
+stages, casts, scenes, baselines/, samples, sensor, pictures, writer, folders, listed_files, manifest, shards,
+entries, executors, ray_executor, progress, dataset, report, runs, checks, flow_files, layouts, picture_store, export,
+pages, commands, __main__.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from datagen.commands import COMMANDS, EXIT_DONE, EXIT_USAGE, make_dataset, run_
 from datagen.spec import SpecError, parse_spec, read_spec_fields
 
 PROGRAM = "python -m datagen"
-NOT_IN_THE_SPEC = ("out", "workers", "slice", "config")
+NOT_IN_THE_SPEC = ("out", "workers", "slice", "config", "executor")
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Arguments:
     out: str
     """Folder of the data set; created if need be."""
     config: str | None = None
-    """TOML file with any of the options below but --workers and --slice; options given here win."""
+    """TOML file with any of the options below but --workers, --executor and --slice; options given here win."""
     count: int = 16
     """Number of frames."""
     width: int = 256
@@ -53,7 +53,13 @@ class Arguments:
     rays_per_pixel: int = 4
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
-    """Frames per second at which a sequence is played."""
+    """Frames per second at which a sequence of frames is played; an animated file has its own times."""
+    lighting: Literal["painted", "lamps", "mixed"] = "painted"
+    """Light painted into the colours; lamps that move and cast shadows, which take longer; or either, clip by clip."""
+    textures: str | None = None
+    """Folder of pictures (PNG, JPEG, WebP, BMP) that floors, walls and half of the bodies wear."""
+    backgrounds: str | None = None
+    """Folder of pictures of which one is behind each clip, instead of walls and skies."""
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""
@@ -83,6 +89,8 @@ class Arguments:
     """Noise in the sharp pictures too."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or Ray's workers: of this machine, or of the cluster that RAY_ADDRESS names."""
     slice: str | None = None
     """Make part i of n, as `3/100`; the other parts may run elsewhere at the same time. Needs --storage shards."""
 
@@ -120,7 +128,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return tell_usage(error.problems)
     except SystemExit as stop:
         return EXIT_DONE if stop.code in (0, None) else EXIT_USAGE
-    return make_dataset(spec, arguments.out, arguments.workers, arguments.slice)
+    return make_dataset(spec, arguments.out, arguments.workers, arguments.slice, arguments.executor)
 
 
 def _defaults(words: Sequence[str]) -> Any:

@@ -1,6 +1,6 @@
 """Assets: people's mesh files, read with distrust (the only door to trimesh).
 
-Before: colour.py, formats.py.  After: sequences.py, scenes.py.
+Before: colour.py, formats.py.  After: sequences.py, animated.py, rosters.py, scenes.py.
 Symbols: V vertices, F faces. Nothing is merged, renumbered or repaired: order is kept.
 """
 
@@ -24,11 +24,6 @@ from datagen.colour import linear_from_srgb
 from datagen.formats import MeshError, announced_faces, read_checked, short_reason, utf8_text
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
-# Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
-UNREAD_SUFFIXES = (
-    ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usd", ".usda", ".usdc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
-    ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
-)  # fmt: skip
 MAX_FACES = 50_000_000
 MAX_VERTICES = 25_000_000
 MAX_COORDINATE = 1e6  # beyond it float32 positions are coarser than a thousandth
@@ -67,35 +62,6 @@ class Roster:
     sha256: str  # of the names and contents of the usable ones
 
 
-def survey_meshes(folder: str | Path) -> Roster:
-    """Read every mesh file under `folder` once and return which can be used.
-
-    Raises:
-        MeshError: none can, or there is none.
-
-    Source: ours.
-    """
-    names, refused, digest = [], [], hashlib.sha256()
-    for name in _files_under(folder):
-        suffix = Path(name).suffix.lower()
-        if suffix in UNREAD_SUFFIXES:
-            refused.append((name, f"expected one of {', '.join(MESH_SUFFIXES)}, got a {suffix} file"))
-        if suffix not in MESH_SUFFIXES:
-            continue
-        path = Path(folder) / name
-        try:
-            asset = load_mesh(str(path))
-        except MeshError as error:
-            refused.append((name, error.reason))
-            continue
-        names.append(name)
-        digest.update(name.encode() + b"\0" + tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity))
-    if not names:
-        found = "; ".join(f"{n}: {r}" for n, r in refused) or "no mesh file at all"
-        raise MeshError(folder, f"expected at least one usable mesh file, got {found}")
-    return Roster(tuple(names), tuple(refused), digest.hexdigest())
-
-
 def load_mesh(path: str) -> MeshAsset:
     """Return a mesh file, checked and normalised; one that has not changed since is not read again.
 
@@ -124,8 +90,11 @@ def file_state(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def _files_under(folder: str | Path) -> list[str]:
-    """Return the relative paths of all files under a folder, sorted; links to folders are not followed."""
+def files_under(folder: str | Path) -> list[str]:
+    """Return the relative paths of all files under a folder, sorted; links to folders are not followed.
+
+    Source: ours.
+    """
     found = []
     for root, _, files in os.walk(folder, followlinks=False):
         found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]
@@ -258,13 +227,13 @@ def normalise(path: str | Path, positions: Tensor, faces: Tensor) -> Tensor:
     if not radius > SMALLEST_EXTENT:
         raise MeshError(path, f"vertices: expected some extent, got a radius of {radius:g}")
     scaled = centred / radius
-    if not any(_has_area(frame[part]) for frame in scaled for part in faces.split(FACES_AT_ONCE)):
+    if not any(has_area(frame[part]) for frame in scaled for part in faces.split(FACES_AT_ONCE)):
         raise MeshError(path, "faces: expected a triangle with an area, got none")
     return scaled
 
 
-def _has_area(corners: Tensor) -> bool:
-    """Tell whether any of the (F, 3, 3) triangles is more than a line."""
+def has_area(corners: Tensor) -> bool:
+    """Tell whether any of the (F, 3, 3) triangles, of a mesh of radius 1, is more than a line. Source: ours."""
     a, b, c = corners.unbind(1)
     return float(torch.linalg.cross(b - a, c - a).norm(dim=-1).max()) > SMALLEST_EXTENT
 

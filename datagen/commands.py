@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from datagen.spec import DatasetSpec, SpecError, parse_spec
 
@@ -84,12 +84,16 @@ class Retry:
     """Of the data set."""
     workers: int = 1
     """Processes that make frames; 0 and 1 work in this one."""
+    executor: Literal["local", "ray"] = "local"
+    """Processes of this machine, or Ray's workers."""
 
     def run(self) -> int:
         """Make the frames. Source: ours."""
         from datagen.folders import read_run
 
-        return make_dataset(parse_spec(read_run(self.folder)["spec"]), self.folder, self.workers)
+        return make_dataset(
+            parse_spec(read_run(self.folder)["spec"]), self.folder, self.workers, executor=self.executor
+        )
 
 
 @dataclass(frozen=True)
@@ -221,7 +225,9 @@ def run_command(command: Any) -> int:
         return EXIT_INTERRUPTED
 
 
-def make_dataset(spec: DatasetSpec, out: str, workers: int, slice_text: str | None = None) -> int:
+def make_dataset(
+    spec: DatasetSpec, out: str, workers: int, slice_text: str | None = None, executor: str = "local"
+) -> int:
     """Generate, tell how it went, and return the exit code.
 
     Args:
@@ -229,6 +235,7 @@ def make_dataset(spec: DatasetSpec, out: str, workers: int, slice_text: str | No
         out: folder of the data set.
         workers: processes.
         slice_text: as `3/100`; all if not given.
+        executor: `local` or `ray`.
 
     Source: ours.
     """
@@ -239,7 +246,7 @@ def make_dataset(spec: DatasetSpec, out: str, workers: int, slice_text: str | No
 
     try:
         part = None if slice_text is None else parse_slice(slice_text)
-        result = generate(spec, out, workers, is_quiet=False, part=part)
+        result = generate(spec, out, workers, is_quiet=False, part=part, executor=executor)
     except (SpecError, MeshError) as error:
         return tell_usage(str(error).splitlines())
     except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again

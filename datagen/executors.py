@@ -1,6 +1,6 @@
 """Executors: where frames are made, in this process or in several of this machine.
 
-Before: nothing (they know no frames, only numbers).  After: runs.py.
+Before: nothing (they know no frames, only numbers).  After: ray_executor.py, runs.py.
 Only text and numbers travel between processes; what a frame is made of is found again there.
 """
 
@@ -43,7 +43,7 @@ def run_serial(task: Task, plan_json: str, folder: str, indices: Iterable[int]) 
     torch.set_num_threads(1)
     try:
         for index in indices:
-            yield _attempt(task, plan_json, folder, index)
+            yield attempt(task, plan_json, folder, index)
     finally:
         torch.set_num_threads(before)
 
@@ -77,7 +77,7 @@ def run_processes(task: Task, plan_json: str, folder: str, indices: Iterable[int
             queue = suspects if alone else waiting
             while room > 0 and queue:
                 index = queue.popleft()
-                running[pool.submit(_attempt, task, plan_json, folder, index)] = index
+                running[pool.submit(attempt, task, plan_json, folder, index)] = index
                 room -= 1
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             is_broken = False
@@ -102,8 +102,8 @@ def run_processes(task: Task, plan_json: str, folder: str, indices: Iterable[int
         _end_pool(pool, is_idle=not running)
 
 
-def _attempt(task: Task, plan_json: str, folder: str, index: int) -> Outcome:
-    """Return the task's outcome; an exception becomes its text, so that the other frames go on."""
+def attempt(task: Task, plan_json: str, folder: str, index: int) -> Outcome:
+    """Return the task's outcome; an exception becomes its text, so that the other frames go on. Source: ours."""
     try:
         return Outcome(index, text=task(plan_json, folder, index))
     except Exception as error:

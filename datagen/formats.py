@@ -1,6 +1,6 @@
 """Formats: what the bytes of a mesh file tell before they are parsed, where the parser would be silent or mislead.
 
-Before: nothing.  After: assets.py, sequences.py.
+Before: nothing.  After: assets.py, sequences.py, gltf.py, usd_files.py.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 MAX_FILE_BYTES = 256 * 2**20  # parsing takes several times as much memory
+MAX_PLAYED_VERTICES = 500_000  # of a mesh that moves by itself: it is held at some 100 instants at once
+MAX_PLAYED_FACES = 1_000_000
 READABLE_EXTENSIONS = re.compile(r"KHR_(materials_\w+|texture_transform|lights_punctual)")
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50

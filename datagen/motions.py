@@ -66,11 +66,15 @@ class RigidMotion:
         return self.path.is_static and self.spin_rad_s == 0
 
     def place(self, vertices: Tensor, times_s: Tensor) -> Tensor:
-        """Return (N, V, 3) float64 world positions of the body's vertices (V, 3) at times (N,) [s]. Source: ours."""
+        """Return (N, V, 3) float64 world positions of the body's vertices, (V, 3) or (N, V, 3), at times (N,) [s].
+
+        Source: ours.
+        """
         rest_angle = math.hypot(*self.rest)
         rest = turns(self.rest if rest_angle else (1.0, 0.0, 0.0), torch.tensor([rest_angle], dtype=torch.float64))[0]
         rotation = turns(self.axis, times_s.to(torch.float64) * self.spin_rad_s) @ rest  # (N, 3, 3)
-        turned = torch.einsum("nij,vj->nvi", rotation, vertices.to(torch.float64))
+        paths = "nij,vj->nvi" if vertices.ndim == 2 else "nij,nvj->nvi"
+        turned = torch.einsum(paths, rotation, vertices.to(torch.float64))
         return turned + self.path.at(times_s).unsqueeze(1)
 
 
@@ -89,6 +93,10 @@ class RigidBody:
     def at(self, times_s: Tensor) -> Tensor:
         """Return (N, V, 3) float64 world positions at times (N,) [s]. Source: ours."""
         return self.motion.place(self.vertices, times_s)
+
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices before any motion."""
+        return self.vertices
 
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times inside the window at which the velocity jumps: none."""
@@ -119,6 +127,10 @@ class PlayedVertices:
         share = (place - first)[:, None, None]
         index = first.long()
         return self.positions[index] * (1 - share) + self.positions[index + 1] * share
+
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices of the first frame."""
+        return self.positions[0]
 
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""
@@ -175,6 +187,15 @@ class CameraPath:
             far=self.far,
         )
         return camera.world_to_clip[: len(times)]
+
+
+def px_per_unit(camera: CameraPath, height: int) -> float:
+    """Return the screen size [px] of a scene unit at the camera's target at time 0, for an image `height` high [px].
+
+    Source: the pinhole camera.
+    """
+    distance = math.dist(camera.eye.at(torch.zeros(1))[0].tolist(), camera.target.at(torch.zeros(1))[0].tolist())
+    return height / (2 * distance * math.tan(math.radians(camera.fov_y_deg) / 2))
 
 
 def turns(axis: Vector, angles_rad: Tensor) -> Tensor:

@@ -1,6 +1,7 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: scenes.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, report.py.  After: commands.py.
+Before: samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py, run_log.py.
+After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
 
@@ -15,15 +16,18 @@ from datagen.executors import Outcome, Task, run_processes, run_serial
 from datagen.folders import Slice, locked_folder, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
+from datagen.ray_executor import check_ray, run_ray
 from datagen.report import effect_shares, write_contact_sheet
+from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
-from datagen.scenes import Plan, plan_from_json, survey_assets
+from datagen.scenes import Plan, plan_from_json, survey_plan
 from datagen.sensor import photograph
 from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
 from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import write_atomically, write_frame
 
 FAILURES_NAME = "failures.json"
+EXECUTORS = ("local", "ray")
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,12 @@ class RunResult:
 
 
 def generate(
-    spec: DatasetSpec, out: str | Path, workers: int = 1, is_quiet: bool = True, part: Slice | None = None
+    spec: DatasetSpec,
+    out: str | Path,
+    workers: int = 1,
+    is_quiet: bool = True,
+    part: Slice | None = None,
+    executor: str = "local",
 ) -> RunResult:
     """Make the data set, or what is missing of it, and return what was achieved.
 
@@ -59,39 +68,48 @@ def generate(
         workers: processes; 0 and 1 work in this one.
         is_quiet: show no progress on stderr.
         part: make these shards only; other slices may be made at the same time. Needs storage `shards`.
+        executor: one of EXECUTORS: `local` (processes of this machine) or `ray` (Ray's workers, `workers` at a time).
 
     Raises:
         SpecError: the folder holds other data, is held by another run, or `workers` is negative, or a slice of what
-            is not stored in shards is asked for.
+            is not stored in shards is asked for, or the executor is not there.
         MeshError: none of the assets can be used; nothing has been written then.
 
     Source: ours.
     """
     if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
         raise SpecError([f"workers: expected an integer of at least 0, got {workers!r}"])
+    if executor not in EXECUTORS:
+        raise SpecError([f"executor: expected one of {', '.join(EXECUTORS)}, got {executor!r}"])
+    if executor == "ray":
+        check_ray()
     spec = settle_storage(spec, Path(out))
     if part is not None and spec.storage != "shards":
         raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
-    roster = survey_assets(spec)
-    plan = Plan(spec, roster.names, roster.sha256)
-    with locked_folder(out, part) as folder:
+    plan, refused = survey_plan(spec)
+    part_text = f"{part.number}/{part.of}" if part else ""
+    with locked_folder(out, part) as folder, logged_run(folder, max(workers, 1), part_text) as note:
         run = _begin(folder, plan, part)
         entries, kept = run.holdings.entries, len(run.holdings.entries)
         repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
         failed = []
         with Progress(run.total, kept, is_quiet) as progress:
-            if roster.refused:
-                progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
+            if refused:
+                progress.say(f"{len(refused)} asset files refused, listed at the end")
             for line in repaired:
                 progress.say(line)
             text = plan.to_json()
-            if workers <= 1:
+            processes = min(max(workers, 1), max(len(run.todo), 1))
+            if executor == "ray":
+                outcomes = run_ray(run.task, text, str(folder), run.todo, processes)
+            elif workers <= 1:
                 outcomes = run_serial(run.task, text, str(folder), run.todo)
             else:
-                outcomes = run_processes(run.task, text, str(folder), run.todo, min(workers, max(len(run.todo), 1)))
+                outcomes = run_processes(run.task, text, str(folder), run.todo, processes)
             for outcome in outcomes:
                 made, lost = _frames_of(outcome, run)
                 failed += lost
+                note.made, note.failed = note.made + len(made), note.failed + len(lost)
                 for index, reason in lost:
                     progress.say(f"failed frame {index}: {reason}")
                     progress.step(is_done=False)
@@ -107,10 +125,10 @@ def generate(
         if run.task is make_frame:
             write_manifest(folder, entries)
         failed.sort()
-        _write_failures(folder, failed, list(roster.refused), part)
+        _write_failures(folder, failed, list(refused), part)
         sheet = write_contact_sheet(folder) if entries and part is None else None
     made_count, shares = len(entries) - kept, effect_shares(entries.values())
-    return RunResult(folder, made_count, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
+    return RunResult(folder, made_count, kept, tuple(failed), refused, sheet, tuple(repaired), shares)
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:

@@ -21,6 +21,7 @@ from random_scenes import Recipe, build, build_shutter, recipes
 
 import torchblur as tb
 from torchblur.backends import choose_backend
+from torchblur.cpu import shadow_rays
 
 N_EXAMPLES = max(60, settings().max_examples)
 ROUNDING = {torch.float64: 1e-12, torch.float32: 2.0**-22}
@@ -55,10 +56,12 @@ def test_scenes_that_differ_in_everything(name, dtype):
     compare(make.to_torch(agreement_scenes.SCENES[name](), dtype), rays=2)
 
 
-@pytest.mark.parametrize("casts_shadows", [False, True], ids=["plain", "shadows"])
+@pytest.mark.parametrize("way", ["plain", "shadows", "hybrid"])
 @pytest.mark.parametrize("name", lit_scenes.SCENES)
-def test_lit_scenes_compiled_or_with_shadows_in_the_hybrid_way(name, casts_shadows):
-    compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=casts_shadows))
+def test_lit_scenes_with_shadows_of_few_casters_and_of_many(name, way, monkeypatch):
+    if way == "hybrid":
+        monkeypatch.setattr(shadow_rays, "MOST", 0)
+    compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=way != "plain"))
 
 
 @pytest.mark.parametrize("direction", ["down", "up", "right", "left"])
@@ -69,7 +72,8 @@ def test_rolling_shutters(direction):
 
 def check(recipe: Recipe) -> None:
     plain, shutter = build(recipe), build_shutter(recipe)
-    scene = lit_scenes.to_torch(plain, torch.float64 if recipe.is_double else torch.float32)
+    dtype = torch.float64 if recipe.is_double else torch.float32
+    scene = lit_scenes.to_torch(plain, dtype, casts_shadows=recipe.seed % 2 == 0)
     real = tb.Shutter(shutter.times, shutter.weights, shutter.line_delay, shutter.direction)
     compare(scene, real, recipe.n_rays)
 
@@ -158,6 +162,25 @@ def test_threads_change_nothing():
     assert all(torch.equal(image, one) for image in found)
 
 
+class Images(torch.utils.data.Dataset):
+    """Sharp images of a scene, made by whoever asks."""
+
+    def __len__(self):
+        return 3
+
+    def __getitem__(self, k):
+        return tb.render_instant(make.to_torch(agreement_scenes.SCENES["opaque"]()), 0.4, backend="cpu").rgba
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_of_a_loader_after_use_in_the_parent(start):
+    own = Images()[0]
+    loader = torch.utils.data.DataLoader(Images(), batch_size=None, num_workers=1, multiprocessing_context=start)
+    images = list(loader)
+    assert len(images) == 3
+    assert all(torch.equal(image, own) for image in images)
+
+
 def test_which_backend_is_chosen():
     scene = {d: make.to_torch(agreement_scenes.SCENES["opaque"](), d) for d in ROUNDING}
     assert choose_backend(scene[torch.float32], "auto") == "cpu"
@@ -178,6 +201,9 @@ def test_gradients_are_those_of_torch():
         assert torch.autograd.grad(image.sum(), color)[0].abs().min() > 0
         with pytest.raises(ValueError, match="backend: expected torch or auto for a scene that asks for gradients"):
             make_image(scene, 2, backend="cpu")
+        with torch.no_grad():  # then there is nothing to differentiate, whatever the tensors ask for
+            assert choose_backend(scene, "auto") == "cpu"
+            torch.testing.assert_close(make_image(scene, 2).rgba, image.detach(), rtol=0, atol=1e-6)
 
 
 def test_recipes_reach_what_the_compiled_code_tells_apart():

@@ -11,7 +11,8 @@ import pytest
 import torch
 
 import datagen.assets
-from datagen.assets import MeshError, load_mesh, survey_meshes
+from datagen.assets import MeshError, load_mesh
+from datagen.rosters import survey_meshes
 from datagen.sequences import load_sequence, survey_sequence
 
 TETRAHEDRON = "v 1 1 1\nv 1 -1 -1\nv -1 1 -1\nv -1 -1 1\n"

@@ -58,6 +58,7 @@ TORCHBLUR = [
     "cpu.jit",
     "cpu.motion",
     "cpu.raster",
+    "cpu.shadow_rays",
     "cpu.lambert",
     "cpu.layers",
     "cpu.instant",
@@ -91,6 +92,8 @@ DOORS = {  # third-party package: the only files that may import it (stems; "*" 
     "PIL": {"datagen": "*"},
     "tomli": {"datagen": {"spec"}},
     "tomllib": {"datagen": {"spec"}},
+    "ray": {"datagen": {"ray_executor"}},
+    "pxr": {"datagen": {"usd_files"}},
     "numba": {"torchblur": {"jit"}},
     "matplotlib": {},
 }

@@ -25,6 +25,7 @@ from torchblur.time_samples import HALTON_BITS, rotated_halton, stratified, sum_
 MAX_TIMES = 1 << HALTON_BITS
 MAX_OWNERS = 2_000_000  # pixels of instants handled together
 MAX_TRIANGLES = 200_000  # faces of instants handled together
+AT_ONCE_COMPILED = 4  # times as many of both where the search is compiled
 SEQUENCES = ("midpoint", "halton")
 PLACES = ("area", "centre")
 
@@ -93,7 +94,8 @@ def accumulate(  # noqa: PLR0913  what random draws, and how they are looked at
     line = shutter.line_of(pixel % camera.width, pixel // camera.width, (camera.width, camera.height))
     line = line if shutter.line_delay else line[:1]  # one weight serves all
     n_faces = max(1, len(surfaces.opacity))
-    batch = max(1, min(MAX_OWNERS // len(pixel), MAX_TRIANGLES // n_faces))
+    at_once = AT_ONCE_COMPILED if backend == "cpu" else 1  # it keeps nothing by pixel or by pair
+    batch = max(1, at_once * min(MAX_OWNERS // len(pixel), MAX_TRIANGLES // n_faces))
     total, (sum_them, _) = 0, instants_by(backend, surfaces)
     for part in torch.arange(times, device=scene.device).split(batch):
         early, late = ends[part].unsqueeze(1), ends[part + 1].unsqueeze(1)

@@ -1,9 +1,9 @@
 """Sharp images on the CPU: what instant.py and fragments.py do, by the compiled scan of raster.py and layers.py.
 
 Before: raster.py, layers.py, fragments.py.  After: instant.py.
-Symbols: B instants, P pixels. Where shadows fall, the search is compiled, and shading.py and shadows.py look at what is
-visible. Rows of pixels are handed out in bands to a pool of threads; each pixel is summed by one of them, in the order
-of the instants, so that results do not depend on the number of threads.
+Symbols: B instants, P pixels. Where many casters throw shadows, the search is compiled, and shading.py and shadows.py
+look at what is visible. Rows of pixels are handed out in bands to a pool of threads; each pixel is summed by one of
+them, in the order of the instants, so that results do not depend on the number of threads.
 Source: ours.
 """
 
@@ -21,6 +21,7 @@ from torchblur.camera import Ray
 from torchblur.cpu import layers, raster
 from torchblur.cpu.lambert import find_lit
 from torchblur.cpu.motion import find_knots, vertices_at
+from torchblur.cpu.shadow_rays import can_look_at_all
 from torchblur.fragments import MAX_PAIRS, Fragments, fragments_of
 from torchblur.scene import Scene
 from torchblur.surfaces import Surfaces
@@ -31,8 +32,8 @@ AT_REST = np.zeros((1, 2))
 
 
 def compiles_looks(surfaces: Surfaces) -> bool:
-    """Return whether the looks of all faces are compiled: all but what shadows may fall on. Ours."""
-    return surfaces.casters is None
+    """Return whether the looks of all faces are compiled: not those with many casters of shadows. Ours."""
+    return can_look_at_all(surfaces)
 
 
 def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray: Ray) -> Iterator[Fragments]:

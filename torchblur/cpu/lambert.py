@@ -1,6 +1,6 @@
-"""The light that a lit face sends to the viewer, compiled, where nothing casts shadows.
+"""The light that a lit face sends to the viewer, compiled.
 
-Before: jit.py, surfaces.py.  After: layers.py.
+Before: jit.py, shadow_rays.py, surfaces.py.  After: layers.py.
 Symbols: M meshes, L lights, R knots of all vertices; linear between knots at equally spaced shutter times.
 Source: as lighting.py and lights.py: Lambert's law, inverse-square law, glTF's spots.
 """
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchblur.cpu import shadow_rays
 from torchblur.cpu.jit import jit
 from torchblur.lights import DirectionalLight, SpotLight
 from torchblur.scene import Scene
@@ -35,6 +36,7 @@ class Lit(NamedTuple):
     cosines: np.ndarray  # (L, 2) float64 of the inner and outer angles
     path: np.ndarray  # (rows, 3) float64 knots of positions or directions, and of targets
     track: np.ndarray  # (L, 4) int64: first row and knots of the position, and of the target
+    blockers: shadow_rays.Blockers
 
 
 def find_lit(scene: Scene, surfaces: Surfaces) -> Lit:
@@ -74,6 +76,7 @@ def find_lit(scene: Scene, surfaces: Surfaces) -> Lit:
         np.array(cosines, dtype=np.float64).reshape(-1, 2),
         np.concatenate(path),
         np.array(track, dtype=np.int64).reshape(-1, 4),
+        shadow_rays.find_blockers(surfaces),
     )
 
 
@@ -148,6 +151,9 @@ def lit_by(lit, shape, hit, f, t):
             elif not cosine >= outer:
                 share = 0.0
         share *= max(nx * tx + ny * ty + nz * tz, 0.0) / math.pi
+        if share > 0 and lit.blockers.casts[m]:
+            light = (lx, ly, lz), lit.kind[m] == DIRECTIONAL
+            share *= shadow_rays.reaching(lit.blockers, light, (px, py, pz), t, f)
         red += share * lit.power[m, 0]
         green += share * lit.power[m, 1]
         blue += share * lit.power[m, 2]

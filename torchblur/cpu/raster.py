@@ -19,6 +19,8 @@ from torchblur.cpu.jit import jit
 HIDDEN, OPAQUE, OTHER = 0, 1, 2  # kinds of faces
 DOUBT = 1e-9  # relative: opaque surfaces nearer to each other than this go through the lists, where ties are resolved
 SLACK_PX = 1e-6  # widening of boxes against rounding
+ROUNDING = 1e-12  # of the product of the factors' sizes: far above that of an edge function
+WIDE = 4  # columns of a box from which on its rows are narrowed
 MIN_W = 1e-300  # against division by zero where a corner is discarded anyway
 
 
@@ -225,6 +227,37 @@ def between(start, end, u):
 
 
 @jit
+def row_span(first, last, n):
+    """Return the first and last of `n` columns, counted from 0, in which a row can meet a face whose corners are
+    `first` and `last` as the rays at both ends of the row see them; the last is below the first if there is none.
+
+    Along a row edge functions are linear. What may be 0 but for rounding is kept. Source: ours.
+    """
+    (ax, ay, _, _), (bx, by, _, _), (cx, cy, _, _) = first
+    (dx, dy, _, _), (ex, ey, _, _), (fx, fy, _, _) = last
+    size_x = max(abs(ax), abs(bx), abs(cx), abs(dx), abs(ex), abs(fx))
+    room = ROUNDING * size_x * max(abs(ay), abs(by), abs(cy))
+    at_first = (bx * cy - by * cx, cx * ay - cy * ax, ax * by - ay * bx)
+    at_last = (ex * fy - ey * fx, fx * dy - fy * dx, dx * ey - dy * ex)
+    if not np.isfinite(room + sum(at_first) + sum(at_last)):
+        return 0, n - 1
+    low, high = n, -1
+    for sign in (1.0, -1.0):  # where all edge functions have this sign, or might
+        start, end = 0.0, n - 1.0
+        for i in range(3):
+            value, change = sign * at_first[i] + room, sign * (at_last[i] - at_first[i]) / (n - 1)
+            if change > 0:
+                start = max(start, -value / change)
+            elif change < 0:
+                end = min(end, -value / change)
+            elif value < 0:
+                end = -2.0
+        if start <= end + 1:
+            low, high = min(low, int(start)), max(high, min(int(end) + 1, n - 1))
+    return low, high
+
+
+@jit
 def scan(shape, faces, rays, rows, found, lists):
     """Find the nearest opaque faces in rows `rows[0]` to `rows[1]`, or list others that may be before these; `lists` is
     the nodes, how many of them are used, and whether to list.
@@ -256,8 +289,17 @@ def scan(shape, faces, rays, rows, found, lists):
                 corner_at(shape.clip_start, v2),
             )
             to0, to1, to2 = corner_at(shape.clip_end, v0), corner_at(shape.clip_end, v1), corner_at(shape.clip_end, v2)
+            n_columns = x_last - x_first + 1
             for row in range(y_first, y_last + 1):
-                for column in range(x_first, x_last + 1):
+                low, high = 0, n_columns - 1
+                if n_columns > WIDE and not moves and rays.is_grid:
+                    rx, end_x, ry = rays.x_ndc[x_first], rays.x_ndc[x_last], rays.y_ndc[row]
+                    low, high = row_span(
+                        (reduced(from0, rx, ry), reduced(from1, rx, ry), reduced(from2, rx, ry)),
+                        (reduced(from0, end_x, ry), reduced(from1, end_x, ry), reduced(from2, end_x, ry)),
+                        n_columns,
+                    )
+                for column in range(x_first + low, x_first + high + 1):
                     p = row * width + column
                     rx = rays.x_ndc[column] if rays.is_grid else rays.x_ndc[p]
                     ry = rays.y_ndc[row] if rays.is_grid else rays.y_ndc[p]

@@ -2,8 +2,8 @@
 
 Before: raster.py, layers.py, motion.py, instant.py, time_samples.py.  After: sampling.py.
 Symbols: N samples a pixel, P pixels of a block of rows; n layers. All samples of one rank in time are looked at
-together; the numbers drawn, and how a ray's time is expressed in its slice, are those of time_samples.py. What
-shadows may fall on takes the hybrid way, as in instant.py.
+together; the numbers drawn, and how a ray's time is expressed in its slice, are those of time_samples.py. Scenes
+of many casters of shadows take the hybrid way, as in instant.py.
 Source: Akenine-Moller et al. 2007, McGuire et al. 2010.
 """
 

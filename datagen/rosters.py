@@ -1,0 +1,80 @@
+"""Rosters: which of people's files can be used, and the hash of all that they hold.
+
+Before: assets.py, sequences.py, animated.py.  After: scenes.py.
+Source: ours.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from datagen.animated import ANIMATED_SUFFIXES, AnimatedAsset, is_animated, load_animated
+from datagen.assets import MESH_SUFFIXES, Roster, files_under, load_mesh, tensors_sha256
+from datagen.formats import MeshError
+from datagen.sequences import survey_sequence
+from datagen.usd_files import USD_SUFFIXES, vet_usd
+
+# Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
+UNREAD_SUFFIXES = (
+    ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
+    ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
+)  # fmt: skip
+
+
+def survey_meshes(folder: str | Path) -> Roster:
+    """Read every mesh file under `folder` once and return which can be used.
+
+    Raises:
+        MeshError: none can, or there is none.
+
+    Source: ours.
+    """
+    names, refused, digest = [], [], hashlib.sha256()
+    for name in files_under(folder):
+        suffix = Path(name).suffix.lower()
+        if suffix in UNREAD_SUFFIXES:
+            refused.append((name, f"expected one of {', '.join((*MESH_SUFFIXES, *USD_SUFFIXES))}, got a {suffix} file"))
+        if suffix not in (*MESH_SUFFIXES, *ANIMATED_SUFFIXES):
+            continue
+        path = Path(folder) / name
+        try:
+            content = _content(path)
+        except MeshError as error:
+            refused.append((name, error.reason))
+            continue
+        names.append(name)
+        digest.update(name.encode() + b"\0" + content)
+    if not names:
+        found = "; ".join(f"{n}: {r}" for n, r in refused) or "no mesh file at all"
+        raise MeshError(folder, f"expected at least one usable mesh file, got {found}")
+    return Roster(tuple(names), tuple(refused), digest.hexdigest())
+
+
+def survey_played(path: str | Path) -> Roster:
+    """Read what is played through time, an animated file or a sequence, once and return its hash.
+
+    Raises:
+        MeshError: it cannot be used.
+
+    Source: ours.
+    """
+    if is_animated(path):
+        asset = _vetted(Path(path))
+        return Roster((asset.name,), (), asset.sha256)
+    return survey_sequence(path)
+
+
+def _vetted(path: Path) -> AnimatedAsset:
+    """Return an animated file, if need be after another process has read it first."""
+    if path.suffix.lower() in USD_SUFFIXES:
+        vet_usd(path)
+    return load_animated(str(path))
+
+
+def _content(path: Path) -> bytes:
+    """Return the hash of what a mesh file holds, animated or not."""
+    if is_animated(path):
+        return bytes.fromhex(_vetted(path).sha256)
+    asset = load_mesh(str(path))
+    return tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity)

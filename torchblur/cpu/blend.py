@@ -64,10 +64,21 @@ def _integral(colours: Colours, s: int, t: float) -> float:
 
 
 @jit
-def _composite(colours: Colours, ray: Ray, cells: Cells, delays: np.ndarray, out: np.ndarray) -> None:
-    """Add what the cells of a ray show to `out` (S, C); `delays` (3, S) of its line, area of the weights, room."""
-    n_shutters, n_meshes = out.shape[0], out.shape[1] - N_LOOKS
-    seen = np.zeros(n_meshes, np.int64)
+def _composite(
+    colours: Colours, ray: Ray, cells: Cells, room: tuple[np.ndarray, np.ndarray], out: tuple[np.ndarray, int, int]
+) -> None:
+    """Add what the cells of a ray show to a pixel of an image (H, W, S, C).
+
+    Args:
+        colours, ray, cells: what is seen.
+        room: (3, S) delays of the line, areas of the weights, and room; (M,) int64 room.
+        out: the image, row and column.
+    """
+    image, row, column = out
+    delays, seen = room
+    n_shutters = image.shape[2]
+    for k in range(len(seen)):
+        seen[k] = 0
     for k in range(cells.count[0]):
         for s in range(n_shutters):
             start, end = cells.t[k, 0] - delays[0, s], cells.t[k, 1] - delays[0, s]
@@ -84,50 +95,74 @@ def _composite(colours: Colours, ray: Ray, cells: Cells, delays: np.ndarray, out
             if alpha > 0 and seen[mesh] != k + 1:
                 seen[mesh] = k + 1
                 for s in range(n_shutters):
-                    out[s, N_LOOKS + mesh] += delays[2, s]
+                    image[row, column, s, N_LOOKS + mesh] += delays[2, s]
             left *= 1 - alpha
             if not left > colours.cutoff:
                 break
         for s in range(n_shutters):
-            out[s, 0] += delays[2, s] * red
-            out[s, 1] += delays[2, s] * green
-            out[s, 2] += delays[2, s] * blue
-            out[s, 3] += delays[2, s] * (1 - left)
+            image[row, column, s, 0] += delays[2, s] * red
+            image[row, column, s, 1] += delays[2, s] * green
+            image[row, column, s, 2] += delays[2, s] * blue
+            image[row, column, s, 3] += delays[2, s] * (1 - left)
 
 
 @jit
-def _roomier(a: np.ndarray, n: int) -> np.ndarray:
-    """Return an array with room for at least `n` rows and the rows of `a`."""
-    if n <= len(a):
-        return a
-    bigger = np.empty((max(2 * len(a), n), *a.shape[1:]), a.dtype)
-    bigger[: len(a)] = a
+def _make_listed(n: int) -> Listed:
+    """Return room for so many pixels, intervals, cells and layers."""
+    ints = np.int64
+    return Listed(
+        np.empty((n, 3), ints),
+        np.empty((n, N_NUMBERS)),
+        np.empty(n, ints),
+        np.empty((n, 2)),
+        np.empty(n, ints),
+        np.empty(n, ints),
+        np.zeros(4, ints),
+    )
+
+
+@jit
+def _with_room(listed: Listed, n: int) -> Listed:
+    """Return the listed with room for `n` of everything."""
+    room = len(listed.layer)
+    if n <= room:
+        return listed
+    bigger = _make_listed(max(2 * room, n))
+    for k in range(4):
+        bigger.size[k] = listed.size[k]
+    for k in range(listed.size[0]):
+        for c in range(3):
+            bigger.pixel[k, c] = listed.pixel[k, c]
+    for k in range(listed.size[1]):
+        bigger.prism[k] = listed.prism[k]
+        for c in range(N_NUMBERS):
+            bigger.data[k, c] = listed.data[k, c]
+    for k in range(listed.size[2]):
+        bigger.t[k, 0], bigger.t[k, 1], bigger.n_layers[k] = listed.t[k, 0], listed.t[k, 1], listed.n_layers[k]
+    for k in range(listed.size[3]):
+        bigger.layer[k] = listed.layer[k]
     return bigger
 
 
 @jit
 def _list(listed: Listed, ray: Ray, n: int, cells: Cells, pixel: int) -> Listed:
     """Append the intervals and the cells of a ray."""
-    n_pixels, n_intervals, n_cells, n_layers = listed.size
-    count = cells.count[0]
+    size, count = listed.size, cells.count[0]
+    n_pixels, n_intervals, n_cells, n_layers = size[0], size[1], size[2], size[3]
     layers = cells.first[count]
-    listed = Listed(
-        _roomier(listed.pixel, n_pixels + 1),
-        _roomier(listed.data, n_intervals + n),
-        _roomier(listed.prism, n_intervals + n),
-        _roomier(listed.t, n_cells + count),
-        _roomier(listed.n_layers, n_cells + count),
-        _roomier(listed.layer, n_layers + layers),
-        listed.size,
-    )
+    listed = _with_room(listed, max(max(n_pixels + 1, n_intervals + n), max(n_cells + count, n_layers + layers)))
     listed.pixel[n_pixels, 0], listed.pixel[n_pixels, 1], listed.pixel[n_pixels, 2] = pixel, n, count
-    listed.data[n_intervals : n_intervals + n] = ray.data[:n]
-    listed.prism[n_intervals : n_intervals + n] = ray.prism[:n]
-    listed.t[n_cells : n_cells + count] = cells.t[:count]
+    for k in range(n):
+        listed.prism[n_intervals + k] = ray.prism[k]
+        for c in range(N_NUMBERS):
+            listed.data[n_intervals + k, c] = ray.data[k, c]
     for k in range(count):
+        listed.t[n_cells + k, 0], listed.t[n_cells + k, 1] = cells.t[k, 0], cells.t[k, 1]
         listed.n_layers[n_cells + k] = cells.first[k + 1] - cells.first[k]
-    listed.layer[n_layers : n_layers + layers] = cells.layer[:layers]
-    listed.size[:] = n_pixels + 1, n_intervals + n, n_cells + count, n_layers + layers
+    for k in range(layers):
+        listed.layer[n_layers + k] = cells.layer[k]
+    size = listed.size
+    size[0], size[1], size[2], size[3] = n_pixels + 1, n_intervals + n, n_cells + count, n_layers + layers
     return listed
 
 
@@ -159,18 +194,9 @@ def see_tiles(
     tile, work, solver = make_tile(), make_work(), make_solver()
     ray, cells = make_ray(64), make_cells(256, 1024)
     counts = np.zeros(len(COUNTS), np.int64)
-    room = FIRST_ROOM if mode != COMPOSITE else 1
-    listed = Listed(
-        np.empty((room, 3), np.int64),
-        np.empty((room, N_NUMBERS)),
-        np.empty(room, np.int64),
-        np.empty((room, 2)),
-        np.empty(room, np.int64),
-        np.empty(room, np.int64),
-        np.zeros(4, np.int64),
-    )
+    listed = _make_listed(FIRST_ROOM if mode != COMPOSITE else 1)
     n_shutters = len(colours.delay)
-    delays = np.zeros((3, n_shutters))
+    delays, seen = np.zeros((3, n_shutters)), np.zeros(max(0, image.shape[3] - N_LOOKS), np.int64)
     for s in range(n_shutters):
         delays[1, s] = _integral(colours, s, colours.time[colours.first[s + 1] - 1])
     window = (view.start, view.end)
@@ -178,8 +204,8 @@ def see_tiles(
     for which_tile in which:
         x0, y0 = which_tile % n_across * TILE_PX, which_tile // n_across * TILE_PX
         width, height = min(TILE_PX, view.width - x0), min(TILE_PX, view.height - y0)
-        tile.place[:] = x0, y0, width, height
-        tile = fill_tile(geometry, view, tile, prisms[offsets[which_tile] : offsets[which_tile + 1]], work)
+        tile.place[0], tile.place[1], tile.place[2], tile.place[3] = x0, y0, width, height
+        tile = fill_tile(geometry, view, tile, (prisms, offsets[which_tile], offsets[which_tile + 1]), work)
         for pixel in range(width * height):
             ray, n = gather_ray(geometry, tile, pixel, window, ray)
             if n == 0:
@@ -187,7 +213,7 @@ def see_tiles(
             column, row = x0 + pixel % width, y0 + pixel // width
             counts[0] += n
             counts[4] = max(counts[4], n)
-            cells.count[:] = 0
+            cells.count[0] = cells.count[1] = 0
             if mode != LIST_INTERVALS:
                 cells = sweep(ray, n, cells, shortest, solver)
             counts[1] += cells.count[0]
@@ -202,7 +228,7 @@ def see_tiles(
                 if way > RIGHT:
                     line = view.width - 1 - column
                 delays[0, s] = colours.delay[s] * line
-            _composite(colours, ray, cells, delays, image[row, column])
+            _composite(colours, ray, cells, (delays, seen), (image, row, column))
     counts[5], counts[6] = tile.counts[1], tile.counts[2]
     return listed, counts
 
@@ -211,25 +237,25 @@ def see_tiles(
 def bin_prisms(geometry: Geometry, view: View) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return the offsets of the tiles' prisms, these in ascending order, and each tile's load [pairs]. Source: ours."""
     n_across, n_down = (view.width + TILE_PX - 1) // TILE_PX, (view.height + TILE_PX - 1) // TILE_PX
-    n = len(geometry.prism)
+    n, b = len(geometry.prism), geometry.bounds_px
     span = np.empty((n, 4), np.int64)
-    offsets = np.zeros(n_across * n_down + 1, np.int64)
-    load = np.zeros(n_across * n_down)
+    offsets, load = np.zeros(n_across * n_down + 1, np.int64), np.zeros(n_across * n_down)
     for k in range(n):
-        b = geometry.bounds_px[k]
-        span[k, 0] = int(min(max(b[0], 0.0), float(view.width))) // TILE_PX
-        span[k, 1] = int(min(max(b[1], 0.0), float(view.height))) // TILE_PX
-        span[k, 2] = min(int(min(max(b[2], 0.0), float(view.width))) // TILE_PX, n_across - 1)
-        span[k, 3] = min(int(min(max(b[3], 0.0), float(view.height))) // TILE_PX, n_down - 1)
+        for side in range(4):
+            size, most = (view.width, n_across - 1) if side % 2 == 0 else (view.height, n_down - 1)
+            span[k, side] = min(int(min(max(b[k, side], 0.0), float(size))) // TILE_PX, most)
         for row in range(span[k, 1], span[k, 3] + 1):
             for column in range(span[k, 0], span[k, 2] + 1):
                 which = row * n_across + column
                 offsets[which + 1] += 1
-                left, right = max(b[0], column * TILE_PX), min(b[2], (column + 1) * TILE_PX)
-                load[which] += (right - left + 1) * (min(b[3], (row + 1) * TILE_PX) - max(b[1], row * TILE_PX) + 1)
-    offsets = np.cumsum(offsets)
-    filled = offsets.copy()
-    prisms = np.empty(offsets[-1], np.int64)
+                left, right = max(b[k, 0], column * TILE_PX), min(b[k, 2], (column + 1) * TILE_PX)
+                top, bottom = max(b[k, 1], row * TILE_PX), min(b[k, 3], (row + 1) * TILE_PX)
+                load[which] += (right - left + 1) * (bottom - top + 1)
+    filled = np.zeros(n_across * n_down, np.int64)
+    for which in range(len(filled)):
+        filled[which] = offsets[which]
+        offsets[which + 1] += offsets[which]
+    prisms = np.empty(offsets[len(filled)], np.int64)
     for k in range(n):
         for row in range(span[k, 1], span[k, 3] + 1):
             for column in range(span[k, 0], span[k, 2] + 1):

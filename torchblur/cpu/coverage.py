@@ -31,7 +31,6 @@ class Work(NamedTuple):
     sign: np.ndarray  # (3 slices, 3 edges) int64
     cut: np.ndarray  # (MAX_CUTS,)
     piece: np.ndarray  # (MAX_CUTS, 2) local times at which the covered pieces start and end
-    cubic: np.ndarray  # (4,)
     room: np.ndarray  # of polynomials.roots_of
     found: np.ndarray  # (MAX_DEGREE,)
     ends: np.ndarray  # (2, 3, 4) corners at the ends of a piece
@@ -47,7 +46,6 @@ def make_work() -> Work:
         np.empty((3, 3), np.int64),
         np.empty(MAX_CUTS),
         np.empty((MAX_CUTS, 2)),
-        np.empty(4),
         np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)),
         np.empty(MAX_DEGREE),
         np.empty((2, 3, 4)),
@@ -55,18 +53,16 @@ def make_work() -> Work:
 
 
 @jit
-def _cross(a: np.ndarray, b: np.ndarray) -> float:
-    return a[0] * b[1] - a[1] * b[0]
-
-
-@jit
-def _edges(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Write the Bernstein coefficients of the edges of corners that move from `a` to `b` (3, 4) to `out` (3, 3)."""
-    out[0, 0], out[0, 1], out[0, 2] = _cross(a[1], a[2]), -_cross(a[0], a[2]), _cross(a[0], a[1])
-    out[2, 0], out[2, 1], out[2, 2] = _cross(b[1], b[2]), -_cross(b[0], b[2]), _cross(b[0], b[1])
-    out[1, 0] = 0.5 * (_cross(a[1], b[2]) + _cross(b[1], a[2]))
-    out[1, 1] = 0.5 * -(_cross(a[0], b[2]) + _cross(b[0], a[2]))
-    out[1, 2] = 0.5 * (_cross(a[0], b[1]) + _cross(b[0], a[1]))
+def _edges(c: np.ndarray, out: np.ndarray) -> None:
+    """Write the Bernstein coefficients of the edges of corners `c` (2, 3, 4) to `out` (3, 3)."""
+    for edge in range(3):
+        i, j = FIRST[edge], SECOND[edge]
+        turn = -1.0 if edge == 1 else 1.0
+        ax, ay, bx, by = c[0, i, 0], c[0, i, 1], c[0, j, 0], c[0, j, 1]
+        px, py, qx, qy = c[1, i, 0], c[1, i, 1], c[1, j, 0], c[1, j, 1]
+        out[0, edge] = turn * (ax * by - ay * bx)
+        out[1, edge] = 0.5 * (turn * ((ax * qy - ay * qx) + (px * by - py * bx)))
+        out[2, edge] = turn * (px * qy - py * qx)
 
 
 @jit
@@ -107,24 +103,28 @@ def _edge_signs(work: Work, edge: int) -> None:
     """Write the signs of an edge before, between and after its roots."""
     e, corner = work.edge, work.corner
     if e[0, edge] > 0 and e[1, edge] > 0 and e[2, edge] > 0:
-        work.sign[:, edge] = 1
+        work.sign[0, edge] = work.sign[1, edge] = work.sign[2, edge] = 1
         return
     if e[0, edge] < 0 and e[1, edge] < 0 and e[2, edge] < 0:
-        work.sign[:, edge] = -1
+        work.sign[0, edge] = work.sign[1, edge] = work.sign[2, edge] = -1
         return
     i, j = FIRST[edge], SECOND[edge]
     turn = -1.0 if edge == 1 else 1.0
-    a, b, c, d = corner[0, i], corner[0, j], corner[1, i], corner[1, j]
-    bend = turn * ((c[0] - a[0]) * (d[1] - b[1]) - (c[1] - a[1]) * (d[0] - b[0])) / 12
+    a0, a1, a2 = corner[0, i, 0], corner[0, i, 1], corner[0, i, 2]
+    b0, b1, b2 = corner[0, j, 0], corner[0, j, 1], corner[0, j, 2]
+    c0, c1, c2 = corner[1, i, 0], corner[1, i, 1], corner[1, i, 2]
+    d0, d1, d2 = corner[1, j, 0], corner[1, j, 1], corner[1, j, 2]
+    bend = turn * ((c0 - a0) * (d1 - b1) - (c1 - a1) * (d0 - b0)) / 12
     start = 0.0
     for k in range(3):
         end = 1.0 if k == 2 else work.root[k, edge]
         u = 0.5 * (start + end)
         v = 1 - u
-        ax, ay, aw = v * a[0] + u * c[0], v * a[1] + u * c[1], v * a[2] + u * c[2]
-        bx, by, bw = v * b[0] + u * d[0], v * b[1] + u * d[1], v * b[2] + u * d[2]
+        ax, ay = v * a0 + u * c0, v * a1 + u * c1
+        bx, by = v * b0 + u * d0, v * b1 + u * d1
         mean = turn * (ax * by - ay * bx) + bend * ((end - start) * (end - start))
         if mean == 0:
+            aw, bw = v * a2 + u * c2, v * b2 + u * d2
             mean = _untied(mean, turn * (ay * bw - aw * by), turn * (aw * bx - ax * bw))
         work.sign[k, edge] = 1 if mean > 0 else -1 if mean < 0 else 0
         start = end
@@ -133,14 +133,16 @@ def _edge_signs(work: Work, edge: int) -> None:
 @jit
 def _still_sign(work: Work) -> int:
     """Return the common sign of the edges of corners at rest, 0 if there is none."""
-    e, corner = work.edge, work.corner[0]
+    e, corner = work.edge, work.corner
     common = 0
     for edge in range(3):
         value = e[0, edge]
         if value == 0:
-            a, b = corner[FIRST[edge]], corner[SECOND[edge]]
+            i, j = FIRST[edge], SECOND[edge]
+            ax, ay, aw = corner[0, i, 0], corner[0, i, 1], corner[0, i, 2]
+            bx, by, bw = corner[0, j, 0], corner[0, j, 1], corner[0, j, 2]
             turn = -1.0 if edge == 1 else 1.0
-            value = _untied(value, turn * (a[1] * b[2] - a[2] * b[1]), turn * (a[2] * b[0] - a[0] * b[2]))
+            value = _untied(value, turn * (ay * bw - aw * by), turn * (aw * bx - ax * bw))
         sign = 1 if value > 0 else -1 if value < 0 else 0
         if sign == 0 or sign * common < 0:
             return 0
@@ -170,16 +172,18 @@ def _plane_at(corner: np.ndarray, c: int, end: int, is_near: bool) -> float:
 @jit
 def _plane_roots(work: Work, is_near: bool, n_cuts: int) -> int:
     """Append the local times at which the hit may cross a clip plane to the cuts, and return their number."""
-    e, cubic = work.edge, work.cubic
-    cubic[:] = 0.0
+    e, cubic = work.edge, work.room
+    cubic[0, 0] = cubic[0, 1] = cubic[0, 2] = cubic[0, 3] = 0.0
     for c in range(3):
         a, b = _plane_at(work.corner, c, 0, is_near), _plane_at(work.corner, c, 1, is_near)
-        cubic[0] += e[0, c] * a
-        cubic[1] += 1 / 3 * (e[0, c] * b) + 2 / 3 * (e[1, c] * a)
-        cubic[2] += 2 / 3 * (e[1, c] * b) + 1 / 3 * (e[2, c] * a)
-        cubic[3] += e[2, c] * b
-    noise = max(max(abs(cubic[0]), abs(cubic[1])), max(abs(cubic[2]), abs(cubic[3]))) * CLIP_NOISE
-    count = roots_of(cubic, 4, noise, work.room, work.found)
+        cubic[0, 0] += e[0, c] * a
+        cubic[0, 1] += 1 / 3 * (e[0, c] * b) + 2 / 3 * (e[1, c] * a)
+        cubic[0, 2] += 2 / 3 * (e[1, c] * b) + 1 / 3 * (e[2, c] * a)
+        cubic[0, 3] += e[2, c] * b
+    noise = 0.0
+    for k in range(4):
+        noise = max(noise, abs(cubic[0, k]) * CLIP_NOISE)
+    count = roots_of(cubic, 4, noise, work.found)
     for k in range(min(count, 3)):
         work.cut[n_cuts] = work.found[k]
         n_cuts += 1
@@ -216,7 +220,7 @@ def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> i
     Source: intervals._covered_pieces.
     """
     e, corner = work.edge, work.corner
-    _edges(corner[0], corner[1], e)
+    _edges(corner, e)
     can_be_positive, can_be_negative = allowed >= 0, allowed <= 0
     is_steady = not is_clipped
     for k in range(3):
@@ -278,31 +282,33 @@ def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> i
 
 
 @jit
-def nearness_of(work: Work, start: float, end: float, orders_by_w: bool, near: np.ndarray) -> None:
-    """Write the Bernstein coefficients of M and D over a piece of local time to `near` (8,).
+def nearness_of(work: Work, start: float, end: float, orders_by_w: bool, out: tuple[np.ndarray, int, int]) -> None:
+    """Write the eight Bernstein coefficients of M and D over a piece of local time to `out`: an array, row and column.
 
     Source: intervals.nearness_coefficients.
     """
-    corner, e = work.corner, work.edge
-    a, b = work.ends[0], work.ends[1]
+    corner, e, ends = work.corner, work.edge, work.ends
+    near, row, first = out
     for c in range(3):
         for k in range(4):
-            a[c, k] = (1 - start) * corner[0, c, k] + start * corner[1, c, k]
-            b[c, k] = (1 - end) * corner[0, c, k] + end * corner[1, c, k]
-    _edges(a, b, e)
-    near[:] = 0.0
+            ends[0, c, k] = (1 - start) * corner[0, c, k] + start * corner[1, c, k]
+            ends[1, c, k] = (1 - end) * corner[0, c, k] + end * corner[1, c, k]
+    _edges(ends, e)
+    m0, m1, m2, m3, d0, d1, d2, d3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for c in range(3):
-        u, v = a[c, 2], b[c, 2]
-        near[4] += e[0, c] * u
-        near[5] += 1 / 3 * (e[0, c] * v) + 2 / 3 * (e[1, c] * u)
-        near[6] += 2 / 3 * (e[1, c] * v) + 1 / 3 * (e[2, c] * u)
-        near[7] += e[2, c] * v
+        u, v = ends[0, c, 2], ends[1, c, 2]
+        d0 += e[0, c] * u
+        d1 += 1 / 3 * (e[0, c] * v) + 2 / 3 * (e[1, c] * u)
+        d2 += 2 / 3 * (e[1, c] * v) + 1 / 3 * (e[2, c] * u)
+        d3 += e[2, c] * v
         if not orders_by_w:
-            u, v = 2 * u - a[c, 3], 2 * v - b[c, 3]
-            near[0] += e[0, c] * u
-            near[1] += 1 / 3 * (e[0, c] * v) + 2 / 3 * (e[1, c] * u)
-            near[2] += 2 / 3 * (e[1, c] * v) + 1 / 3 * (e[2, c] * u)
-            near[3] += e[2, c] * v
+            u, v = 2 * u - ends[0, c, 3], 2 * v - ends[1, c, 3]
+            m0 += e[0, c] * u
+            m1 += 1 / 3 * (e[0, c] * v) + 2 / 3 * (e[1, c] * u)
+            m2 += 2 / 3 * (e[1, c] * v) + 1 / 3 * (e[2, c] * u)
+            m3 += e[2, c] * v
     if orders_by_w:
-        s0, s1, s2 = (e[0, 0] + e[0, 1]) + e[0, 2], (e[1, 0] + e[1, 1]) + e[1, 2], (e[2, 0] + e[2, 1]) + e[2, 2]
-        near[0], near[1], near[2], near[3] = s0, (s0 + 2 * s1) / 3, (2 * s1 + s2) / 3, s2
+        m0, s1, m3 = (e[0, 0] + e[0, 1]) + e[0, 2], (e[1, 0] + e[1, 1]) + e[1, 2], (e[2, 0] + e[2, 1]) + e[2, 2]
+        m1, m2 = (m0 + 2 * s1) / 3, (2 * s1 + m3) / 3
+    near[row, first], near[row, first + 1], near[row, first + 2], near[row, first + 3] = m0, m1, m2, m3
+    near[row, first + 4], near[row, first + 5], near[row, first + 6], near[row, first + 7] = d0, d1, d2, d3

@@ -17,11 +17,10 @@ import numpy as np
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cells import CROSSING_NOISE
 from torchblur.cpu.jit import jit
-from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of
+from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of, sort_by
 from torchblur.sort import TIE
 
 T_START, T_END, NUM, DEN, LOW, HIGH, N_NUMBERS = 0, 1, 2, 6, 10, 11, 12
-FEW = 24  # intervals: so many are sorted by insertion
 
 
 class Ray(NamedTuple):
@@ -49,24 +48,22 @@ class Cells(NamedTuple):
 class Solver(NamedTuple):
     """Room to look for crossings."""
 
-    piece: np.ndarray  # (4, 4)
-    product: np.ndarray  # (MAX_DEGREE + 1,)
-    room: np.ndarray
-    found: np.ndarray
+    room: np.ndarray  # of polynomials.roots_of
+    found: np.ndarray  # (MAX_DEGREE,)
 
 
 @jit
 def make_ray(n: int) -> Ray:
     """Return room for `n` intervals."""
-    ints = np.empty((4, n), np.int64)
+    ints = np.int64
     return Ray(
         np.empty((n, N_NUMBERS)),
-        ints[0],
-        ints[1],
+        np.empty(n, ints),
+        np.empty(n, ints),
         np.empty(n, np.bool_),
-        ints[2],
-        ints[3],
-        np.empty(n, np.int64),
+        np.empty(n, ints),
+        np.empty(n, ints),
+        np.empty(n, ints),
         np.empty(n),
     )
 
@@ -82,8 +79,7 @@ def make_cells(n_cells: int, n_layers: int) -> Cells:
 @jit
 def make_solver() -> Solver:
     """Return room to look for crossings."""
-    n = MAX_DEGREE + 1
-    return Solver(np.empty((4, 4)), np.empty(n), np.empty((MAX_HALVINGS + 4, n + 2)), np.empty(MAX_DEGREE))
+    return Solver(np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
 
 
 @jit
@@ -96,8 +92,8 @@ def _local(ray: Ray, i: int, t: float) -> float:
 @jit
 def _nearness(ray: Ray, i: int, t: float) -> float:
     u = _local(ray, i, t)
-    den = cubic_at(ray.data[i, DEN:LOW], u)
-    return cubic_at(ray.data[i, NUM:DEN], u) / den if den != 0 else np.inf
+    den = cubic_at(ray.data, i, DEN, u)
+    return cubic_at(ray.data, i, NUM, u) / den if den != 0 else np.inf
 
 
 @jit
@@ -151,34 +147,38 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
 
 
 @jit
-def _first_crossing(ray: Ray, i: int, j: int, start: float, least: float, solver: Solver) -> float:
+def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
     """Return the first time after `start`, by more than `least`, at which two intervals change places; or the first of
     their ends.
     """
-    data = ray.data
+    data, f = ray.data, solver.room
+    i, j = pair
     end = min(data[i, T_END], data[j, T_END])
-    c, f, size = solver.piece, solver.product, 0.0
-    size_i = restrict_cubic(data[i, NUM:DEN], _local(ray, i, start), _local(ray, i, end), c[0])
-    size_i_den = restrict_cubic(data[i, DEN:LOW], _local(ray, i, start), _local(ray, i, end), c[1])
-    size_j = restrict_cubic(data[j, NUM:DEN], _local(ray, j, start), _local(ray, j, end), c[2])
-    size_j_den = restrict_cubic(data[j, DEN:LOW], _local(ray, j, start), _local(ray, j, end), c[3])
-    a, b, p, q = c[0], c[1], c[2], c[3]  # F = a q - p b
-    f[0] = a[0] * q[0] - p[0] * b[0]
-    f[1] = 0.5 * (a[0] * q[1] + a[1] * q[0] - p[0] * b[1] - p[1] * b[0])
-    f[2] = 0.2 * (a[0] * q[2] + a[2] * q[0] - p[0] * b[2] - p[2] * b[0]) + 0.6 * (a[1] * q[1] - p[1] * b[1])
-    f[3] = 0.05 * (a[0] * q[3] + a[3] * q[0] - p[0] * b[3] - p[3] * b[0]) + 0.45 * (
-        a[1] * q[2] + a[2] * q[1] - p[1] * b[2] - p[2] * b[1]
-    )
-    f[4] = 0.2 * (a[1] * q[3] + a[3] * q[1] - p[1] * b[3] - p[3] * b[1]) + 0.6 * (a[2] * q[2] - p[2] * b[2])
-    f[5] = 0.5 * (a[2] * q[3] + a[3] * q[2] - p[2] * b[3] - p[3] * b[2])
-    f[6] = a[3] * q[3] - p[3] * b[3]
-    size = CROSSING_NOISE * (size_i * size_j_den + size_j * size_i_den)
+    part_i, part_j = (_local(ray, i, start), _local(ray, i, end)), (_local(ray, j, start), _local(ray, j, end))
+    a0, a1, a2, a3 = restrict_cubic(data, i, NUM, part_i)
+    b0, b1, b2, b3 = restrict_cubic(data, i, DEN, part_i)
+    p0, p1, p2, p3 = restrict_cubic(data, j, NUM, part_j)
+    q0, q1, q2, q3 = restrict_cubic(data, j, DEN, part_j)  # F = a q - p b
+    f[0, 0] = a0 * q0 - p0 * b0
+    f[0, 1] = 0.5 * ((a0 * q1 + a1 * q0) - (p0 * b1 + p1 * b0))
+    f[0, 2] = 0.2 * ((a0 * q2 + a2 * q0) - (p0 * b2 + p2 * b0)) + 0.6 * (a1 * q1 - p1 * b1)
+    f[0, 3] = 0.05 * ((a0 * q3 + a3 * q0) - (p0 * b3 + p3 * b0)) + 0.45 * ((a1 * q2 + a2 * q1) - (p1 * b2 + p2 * b1))
+    f[0, 4] = 0.2 * ((a1 * q3 + a3 * q1) - (p1 * b3 + p3 * b1)) + 0.6 * (a2 * q2 - p2 * b2)
+    f[0, 5] = 0.5 * ((a2 * q3 + a3 * q2) - (p2 * b3 + p3 * b2))
+    f[0, 6] = a3 * q3 - p3 * b3
+    size_i = _largest(a0, a1, a2, a3) * _largest(q0, q1, q2, q3)
+    size_j = _largest(p0, p1, p2, p3) * _largest(b0, b1, b2, b3)
     first = end
-    for k in range(roots_of(f, MAX_DEGREE + 1, size, solver.room, solver.found)):
+    for k in range(roots_of(f, MAX_DEGREE + 1, CROSSING_NOISE * (size_i + size_j), solver.found)):
         t = start + solver.found[k] * (end - start)
         if t - start > least:
             first = min(first, t)
     return first
+
+
+@jit
+def _largest(a: float, b: float, c: float, d: float) -> float:
+    return max(max(abs(a), abs(b)), max(abs(c), abs(d)))
 
 
 @jit
@@ -193,7 +193,7 @@ def _certify(ray: Ray, n: int, opaque: int, cell: tuple[float, float, float], so
         above, own = active[k - 1 if k <= opaque else opaque], active[k]
         if data[above, LOW] > data[own, HIGH] or (ray.upper[own] == above and ray.until[own] >= end):
             continue
-        t = _first_crossing(ray, above, own, start, least, solver)
+        t = _first_crossing(ray, (above, own), start, least, solver)
         if until - t > least:
             end = min(end, t)
             ray.upper[own] = -1
@@ -218,10 +218,11 @@ def _emit(cells: Cells, ray: Ray, opaque: int, start: float, end: float) -> Cell
             return cells
     if n + 1 > len(cells.t) or first + opaque + 1 > len(cells.layer):
         bigger = make_cells(max(2 * len(cells.t), n + 1), max(2 * len(cells.layer), first + opaque + 1))
-        bigger.t[:n] = cells.t[:n]
-        bigger.first[: n + 1] = cells.first[: n + 1]
-        bigger.layer[:first] = cells.layer[:first]
-        bigger.count[:] = cells.count
+        for k in range(n):
+            bigger.t[k, 0], bigger.t[k, 1], bigger.first[k + 1] = cells.t[k, 0], cells.t[k, 1], cells.first[k + 1]
+        for k in range(first):
+            bigger.layer[k] = cells.layer[k]
+        bigger.count[0], bigger.count[1] = cells.count[0], cells.count[1]
         cells = bigger
     cells.t[n, 0], cells.t[n, 1] = start, end
     for k in range(opaque + 1):
@@ -229,21 +230,6 @@ def _emit(cells: Cells, ray: Ray, opaque: int, start: float, end: float) -> Cell
     cells.first[n + 1] = first + opaque + 1
     cells.count[0] = n + 1
     return cells
-
-
-@jit
-def sort_by(key: np.ndarray, n: int, order: np.ndarray) -> None:
-    """Put the numbers 0 to `n` - 1 that `order` holds in ascending order of their `key`."""
-    if n > FEW:
-        order[:n] = order[:n][np.argsort(key[order[:n]], kind="mergesort")]
-        return
-    for k in range(1, n):
-        own = order[k]
-        place = k
-        while place > 0 and key[order[place - 1]] > key[own]:
-            order[place] = order[place - 1]
-            place -= 1
-        order[place] = own
 
 
 @jit
@@ -259,12 +245,12 @@ def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> Ce
 
     Source: Ronnow et al. 2021, alg. 1.
     """
-    cells.count[:] = 0
+    cells.count[0] = cells.count[1] = 0
     data, by_end, active = ray.data, ray.by_end, ray.active
     for k in range(n):
         by_end[k] = k
         ray.upper[k] = -1
-    sort_by(data[:, T_END], n, by_end)
+    sort_by(data, T_END, by_end, n)
     now, next_start, next_end, n_active = data[0, T_START], 0, 0, 0
     while True:
         while next_end < n and data[by_end[next_end], T_END] <= now:

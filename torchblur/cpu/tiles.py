@@ -16,7 +16,8 @@ import numpy as np
 
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
 from torchblur.cpu.jit import jit
-from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START, Ray, make_ray, sort_by
+from torchblur.cpu.polynomials import sort_by
+from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START, Ray, make_ray
 from torchblur.hidden import CLEARLY
 from torchblur.intervals import SHORTEST
 from torchblur.pairs import ROUNDING
@@ -24,6 +25,7 @@ from torchblur.prisms import BOUND_SLACK_PX
 
 SLICES = 8
 TILE_PX = 32
+MOST_PIECES = 16  # more than the intervals of one pair
 EVERY = 16  # prisms after which the tile's cover is looked at anew
 PAIRS = np.array(list(itertools.combinations(range(6), 2)))
 X, Y, W, Z = 0, 1, 2, 3
@@ -91,16 +93,17 @@ def make_tile() -> Tile:
 
 
 @jit
-def _columns(corners: np.ndarray, level: float, low: int, high: int, x_px: float) -> tuple[int, int]:
-    """Return the first and last column, between `low` and `high`, inside the hull of corners; see pairs.py."""
-    x, y = corners[0], corners[1]
+def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_px: float) -> tuple[int, int]:
+    """Return the first and last column between `ends` inside the hull of the corners of a prism; see pairs.py."""
+    low, high = ends
     left, right, most = np.inf, -np.inf, 0.0
     for k in range(6):
-        most = max(most, max(abs(x[k]), abs(y[k])))
+        most = max(most, max(abs(c[which, 0, k]), abs(c[which, 1, k])))
     for k in range(len(PAIRS)):
         i, j = PAIRS[k, 0], PAIRS[k, 1]
-        if (y[i] <= level) != (y[j] <= level):
-            place = x[i] + (level - y[i]) / (y[j] - y[i]) * (x[j] - x[i])
+        y_i, y_j = c[which, 1, i], c[which, 1, j]
+        if (y_i <= level) != (y_j <= level):
+            place = c[which, 0, i] + (level - y_i) / (y_j - y_i) * (c[which, 0, j] - c[which, 0, i])
             left, right = min(left, place), max(right, place)
     slack = BOUND_SLACK_PX + ROUNDING * most
     if not left <= right or not slack < 1:
@@ -123,14 +126,15 @@ def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window:
         opens = window[0] + s * length
         closes = window[0] + (s + 1) * length if s < SLICES - 1 else window[1]
         a, b = max(start, opens), min(end, closes)
-        run = tile.run[pixel, s]
-        if a <= run[1] and b >= run[0]:
-            run[0], run[1], run[2] = min(a, run[0]), max(b, run[1]), min(nearness, run[2])
-        elif b - a > run[1] - run[0]:
-            run[0], run[1], run[2] = a, b, nearness
-        if run[0] <= opens and run[1] >= closes:
-            tile.cover[pixel, s] = max(tile.cover[pixel, s], run[2])
-            run[0], run[1] = np.inf, -np.inf
+        run = tile.run
+        if a <= run[pixel, s, 1] and b >= run[pixel, s, 0]:
+            a, b = min(a, run[pixel, s, 0]), max(b, run[pixel, s, 1])
+            run[pixel, s, 0], run[pixel, s, 1], run[pixel, s, 2] = a, b, min(nearness, run[pixel, s, 2])
+        elif b - a > run[pixel, s, 1] - run[pixel, s, 0]:
+            run[pixel, s, 0], run[pixel, s, 1], run[pixel, s, 2] = a, b, nearness
+        if run[pixel, s, 0] <= opens and run[pixel, s, 1] >= closes:
+            tile.cover[pixel, s] = max(tile.cover[pixel, s], run[pixel, s, 2])
+            run[pixel, s, 0], run[pixel, s, 1] = np.inf, -np.inf
             is_closer = True
     if is_closer:
         least = tile.cover[pixel, 0]
@@ -156,21 +160,24 @@ def _grown(tile: Tile) -> Tile:
     """Return the tile with twice the room for intervals."""
     n = len(tile.prism)
     data, prism, following = np.empty((2 * n, N_NUMBERS)), np.empty(2 * n, np.int64), np.empty(2 * n, np.int64)
-    data[:n], prism[:n], following[:n] = tile.data, tile.prism, tile.next
+    for k in range(n):
+        prism[k], following[k] = tile.prism[k], tile.next[k]
+        for c in range(N_NUMBERS):
+            data[k, c] = tile.data[k, c]
     return Tile(tile.place, data, prism, following, tile.last, tile.cover, tile.least, tile.run, tile.counts)
 
 
 @jit
-def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> Tile:
+def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> None:
     """Find the intervals in which a prism covers a ray, `who`: prism, pixel of the tile, x and y in NDC."""
     k, pixel, x_ndc, y_ndc = who
-    corner, clip = work.corner, geometry.clip[k]
+    corner, clip = work.corner, geometry.clip
     for end in range(2):
         for c in range(3):
-            w = clip[end, c, W]
-            corner[end, c, 0] = clip[end, c, X] - x_ndc * w
-            corner[end, c, 1] = clip[end, c, Y] - y_ndc * w
-            corner[end, c, 2], corner[end, c, 3] = w, clip[end, c, Z]
+            w = clip[k, end, c, W]
+            corner[end, c, 0] = clip[k, end, c, X] - x_ndc * w
+            corner[end, c, 1] = clip[k, end, c, Y] - y_ndc * w
+            corner[end, c, 2], corner[end, c, 3] = w, clip[k, end, c, Z]
     n_pieces = find_pieces(work, geometry.is_clipped[k], geometry.is_still[k], geometry.allowed[k])
     window, opens, closes = (view.start, view.end), geometry.t[k, 0], geometry.t[k, 1]
     for m in range(n_pieces):
@@ -178,69 +185,69 @@ def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, floa
         t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
         if not t_end - t_start > SHORTEST * (view.end - view.start):
             continue
-        n = tile.counts[0]
-        if n == len(tile.prism):
-            tile = _grown(tile)
-        data = tile.data[n]
-        nearness_of(work, start, end, view.orders_by_w, data[NUM:LOW])
-        low, high = -np.inf, np.inf
-        den = data[DEN:LOW]
-        if (den[0] > 0 and den[1] > 0 and den[2] > 0 and den[3] > 0) or (
-            den[0] < 0 and den[1] < 0 and den[2] < 0 and den[3] < 0
-        ):
-            low, high = np.inf, -np.inf
-            for c in range(4):
-                ratio = data[NUM + c] / den[c]
-                low, high = min(low, ratio), max(high, ratio)
+        n, data = tile.counts[0], tile.data
+        nearness_of(work, start, end, view.orders_by_w, (data, n, NUM))
+        is_front, is_back, low, high = True, True, np.inf, -np.inf
+        for c in range(4):
+            den = data[n, DEN + c]
+            is_front, is_back = is_front and den > 0, is_back and den < 0
+            ratio = data[n, NUM + c] / den
+            low, high = min(low, ratio), max(high, ratio)
+        if not (is_front or is_back):
+            low, high = -np.inf, np.inf
         if high < (1 - CLEARLY) * _cover_of(tile, pixel, (t_start, t_end), window):
             continue
-        data[T_START], data[T_END], data[LOW], data[HIGH] = t_start, t_end, low, high
+        data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = t_start, t_end, low, high
         tile.prism[n], tile.next[n] = k, tile.last[pixel]
         tile.last[pixel] = n
         tile.counts[0] = n + 1
         if geometry.hides[k] and low > 0:
             _close(tile, pixel, (t_start, t_end, low), window)
-    return tile
 
 
 @jit
-def fill_tile(geometry: Geometry, view: View, tile: Tile, prisms: np.ndarray, work: Work) -> Tile:
+def fill_tile(geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarray, int, int], work: Work) -> Tile:
     """Find the intervals of all rays of a tile.
 
     Args:
         geometry: of the prisms.
         view: the image.
         tile: whose place is set.
-        prisms: (n,) which may touch the tile, in ascending order.
+        which: prisms, and the first and last (exclusive) of those that may touch the tile; these ascend.
         work: room.
 
     Source: ours.
     """
     x0, y0, width, height = tile.place[0], tile.place[1], tile.place[2], tile.place[3]
+    prisms, first, last = which
     n_pixels = width * height
     tile.counts[0] = 0
-    tile.last[:n_pixels] = -1
-    tile.cover[:n_pixels] = 0.0
-    tile.least[:n_pixels] = 0.0
-    tile.run[:n_pixels, :, 0] = np.inf
-    tile.run[:n_pixels, :, 1] = -np.inf
-    for m in range(len(prisms)):
+    for pixel in range(n_pixels):
+        tile.last[pixel], tile.least[pixel] = -1, 0.0
+        for k in range(SLICES):
+            tile.cover[pixel, k], tile.run[pixel, k, 0], tile.run[pixel, k, 1] = 0.0, np.inf, -np.inf
+    least = 0.0
+    for m in range(first, last):
         k = prisms[m]
-        high, bounds = geometry.high[k], geometry.bounds_px[k]
-        if m % EVERY == 0 and high < (1 - CLEARLY) * tile.least[:n_pixels].min():
+        high, bounds = geometry.high[k], geometry.bounds_px
+        if (m - first) % EVERY == 0:
+            least = np.inf
+            for pixel in range(n_pixels):
+                least = min(least, tile.least[pixel])
+        if high < (1 - CLEARLY) * least:
             break
-        first_row = int(max(np.ceil(max(bounds[1], -1.0) - view.y_px), y0))
-        last_row = int(min(np.floor(min(bounds[3], float(view.height)) - view.y_px), y0 + height - 1))
-        low = int(max(np.ceil(max(bounds[0], -1.0) - view.x_px), x0))
-        most = int(min(np.floor(min(bounds[2], float(view.width)) - view.x_px), x0 + width - 1))
+        first_row = int(max(np.ceil(max(bounds[k, 1], -1.0) - view.y_px), y0))
+        last_row = int(min(np.floor(min(bounds[k, 3], float(view.height)) - view.y_px), y0 + height - 1))
+        low = int(max(np.ceil(max(bounds[k, 0], -1.0) - view.x_px), x0))
+        most = int(min(np.floor(min(bounds[k, 2], float(view.width)) - view.x_px), x0 + width - 1))
         if low > most:
             continue
         times, window = (geometry.t[k, 0], geometry.t[k, 1]), (view.start, view.end)
         is_whole = times[0] <= view.start and times[1] >= view.end
         for row in range(first_row, last_row + 1):
-            first, last = _columns(geometry.corners_px[k], row + view.y_px, low, most, view.x_px)
+            left, right = _columns(geometry.corners_px, k, row + view.y_px, (low, most), view.x_px)
             y_ndc = 1 - 2 * (row + view.y_px) / view.height
-            for column in range(first, last + 1):
+            for column in range(left, right + 1):
                 pixel = (row - y0) * width + column - x0
                 cover = tile.least[pixel] if is_whole else _cover_of(tile, pixel, times, window)
                 if high < (1 - CLEARLY) * cover:
@@ -248,7 +255,9 @@ def fill_tile(geometry: Geometry, view: View, tile: Tile, prisms: np.ndarray, wo
                     continue
                 tile.counts[1] += 1
                 x_ndc = 2 * (column + view.x_px) / view.width - 1
-                tile = _solve(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
+                if tile.counts[0] + MOST_PIECES > len(tile.prism):
+                    tile = _grown(tile)
+                _solve(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
     return tile
 
 
@@ -263,12 +272,12 @@ def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, 
         ray = make_ray(2 * n)
     n, i = 0, tile.last[pixel]
     while i >= 0:
-        own = tile.data[i]
-        if own[HIGH] >= (1 - CLEARLY) * _cover_of(tile, pixel, (own[T_START], own[T_END]), window):
+        times = tile.data[i, T_START], tile.data[i, T_END]
+        if tile.data[i, HIGH] >= (1 - CLEARLY) * _cover_of(tile, pixel, times, window):
             ray.active[n] = i
             n += 1
         i = tile.next[i]
-    sort_by(tile.data[:, T_START], n, ray.active)
+    sort_by(tile.data, T_START, ray.active, n)
     for m in range(n):
         i = ray.active[m]
         k = tile.prism[i]

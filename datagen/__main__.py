@@ -54,6 +54,12 @@ class Arguments:
     """Rays inside each pixel, each exact in time; 1 is the pixel's centre."""
     sequence_fps: float = 24.0
     """Frames per second at which a sequence of frames is played; an animated file has its own times."""
+    lighting: Literal["painted", "lamps", "mixed"] = "painted"
+    """Light painted into the colours; lamps that move and cast shadows, which take longer; or either, clip by clip."""
+    textures: str | None = None
+    """Folder of pictures (PNG, JPEG, WebP, BMP) that floors, walls and half of the bodies wear."""
+    backgrounds: str | None = None
+    """Folder of pictures of which one is behind each clip, instead of walls and skies."""
     baselines: str = ""
     """Filters whose images are stored beside the exact one: some of directional, mcguire2012, guertin2014, guertin2015,
     between commas."""

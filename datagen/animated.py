@@ -136,6 +136,11 @@ class PlayedAction:
             raise MeshError(action.name, "expected an animation that stays finite, got one that does not")
         return self.motion.place(positions, times)
 
+    def resting(self) -> Tensor:
+        """Return the (V, 3) float64 places of the first key, before the whole body moves [scene units]."""
+        action = self.action
+        return (action.pose.at(action.pose.keys_s[:1])[0] - action.centre) * (self.size / action.radius)
+
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times strictly inside the window at which a key or a turn is reached, MAX_KINKS at most [s].
 

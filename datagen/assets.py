@@ -9,6 +9,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import io
+import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -87,6 +88,17 @@ def file_state(path: Path) -> tuple[int, int]:
     except OSError as error:
         raise MeshError(path, f"expected a file, got {short_reason(error)}") from None
     return found.st_mtime_ns, found.st_size
+
+
+def files_under(folder: str | Path) -> list[str]:
+    """Return the relative paths of all files under a folder, sorted; links to folders are not followed.
+
+    Source: ours.
+    """
+    found = []
+    for root, _, files in os.walk(folder, followlinks=False):
+        found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]
+    return sorted(found)
 
 
 def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tuple[str, ...]]:

@@ -7,6 +7,7 @@ Symbols: F faces; colours linear RGB.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 
 from datagen.clips import Actor
 from datagen.motions import Path, RigidBody, RigidMotion, Sway, Vector
-from datagen.patterns import PATTERNS, light, paint
+from datagen.patterns import PATTERNS, lit_color, paint
 from datagen.shapes import (
     Shape,
     ball,
@@ -45,13 +46,16 @@ MAX_SPIN_RAD_S = 75.0  # 90 degrees in REFERENCE_S
 CLEAR_SHARE = 0.16  # of the bodies are semi-transparent
 
 
-def build_cast(rngs: tuple[np.random.Generator, ...], colours: Tensor, aspect: float) -> list[Actor]:
+def build_cast(
+    rngs: tuple[np.random.Generator, ...], colours: Tensor, aspect: float, is_lit: bool = False
+) -> list[Actor]:
     """Return four to eight bodies that fly, turn or stand about the origin.
 
     Args:
         rngs: streams `cast`, `motion` and `colour`.
         colours: (5, 3) palette, the backdrop's colour first.
         aspect: width / height of the image.
+        is_lit: whether lamps light them; otherwise a fixed light is painted in.
 
     Source: ours.
     """
@@ -62,7 +66,10 @@ def build_cast(rngs: tuple[np.random.Generator, ...], colours: Tensor, aspect: f
         kind = str(cast_rng.choice(KINDS, p=KIND_WEIGHTS))
         size = float(cast_rng.uniform(0.62, 1.15)) * (1.3 if n < 6 else 1.0)
         shape = build_shape(kind, cast_rng).scaled([size] * 3)
-        actors.append(_dress(f"{kind}-{k}", shape, kind, colours, colour_rng, choose_motion(motion_rng, place, size)))
+        body = RigidBody(shape.vertices, choose_motion(motion_rng, place, size))
+        actors.append(
+            Actor(f"{kind}-{k}", shape.faces, motion=body, **_looks(shape, kind, colours, colour_rng, is_lit))
+        )
     return actors
 
 
@@ -163,8 +170,8 @@ def unit_vector(rng: np.random.Generator, flat: float = 1.0) -> Vector:
     return tuple(float(c) for c in vector / np.linalg.norm(vector))
 
 
-def _dress(name: str, shape: Shape, kind: str, colours: Tensor, rng: np.random.Generator, motion: RigidMotion) -> Actor:
-    """Return the actor with colours and opacity."""
+def _looks(shape: Shape, kind: str, colours: Tensor, rng: np.random.Generator, is_lit: bool) -> dict[str, Any]:
+    """Return an actor's colours, opacity and sides, and whether lamps light it."""
     order = rng.permutation(len(colours) - 1) + 1
     own = colours[torch.from_numpy(order)]
     if rng.random() < 0.3:
@@ -173,10 +180,14 @@ def _dress(name: str, shape: Shape, kind: str, colours: Tensor, rng: np.random.G
     is_clear, opacity = rng.random() < CLEAR_SHARE, float(rng.uniform(0.3, 0.65))
     is_open = not shape.is_closed
     if kind == "lamp":  # brighter than white: leaves saturated streaks
-        color: Tensor = (own[0] * 0.5 + 0.5) * float(rng.uniform(3, 8))
-        is_clear = False
+        color = ((own[0] * 0.5 + 0.5) * float(rng.uniform(3, 8))).to(torch.float32)
+        is_clear = is_lit = False
     else:
-        color = light(shape, paint(shape, own, pattern, rng), two_sided=is_open)
+        color = lit_color(shape, paint(shape, own, pattern, rng), is_lit, two_sided=is_open)
     one_sided = shape.is_closed and not is_clear and rng.random() < 0.7
-    body = RigidBody(shape.vertices, motion)
-    return Actor(name, shape.faces, color.to(torch.float32), body, opacity if is_clear else 1.0, not one_sided)
+    return {
+        "color": color,
+        "opacity": opacity if is_clear else 1.0,
+        "double_sided": not one_sided,
+        "is_lit": is_lit,
+    }

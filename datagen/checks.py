@@ -2,8 +2,8 @@
 
 Before: folders.py, manifest.py, shards.py, entries.py.  After: commands.py.
 What is covered: `run.json` and the shards' markers by checksums of their own, every line of `manifest.jsonl` by being
-just what that configuration writes, all else by the checksums in them. Not covered are `contact_sheet.png` and the
-lists of failures.
+just what that configuration writes, all else by the checksums in them. Not covered are `contact_sheet.png`, the
+lists of failures and the log of runs.
 """
 
 from __future__ import annotations

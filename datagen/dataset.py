@@ -29,6 +29,7 @@ PLANES: dict[str, tuple[str, tuple[str, ...]]] = {
     "motion_previous": ("data", ("previous.u", "previous.v")),
     "depth": ("data", ("Z",)),
     "alpha": ("data", ("A",)),
+    "shadow": ("data", ("shadow",)),
     "sharp_alpha": ("sharp", ("A",)),
 }
 IDS = {"mesh_id": "id.mesh", "face_id": "id.face"}
@@ -40,9 +41,10 @@ class BlurDataset(Dataset[dict[str, Any]]):
     An item is a dict of tensors: `sharp`, `blurred` (3, H, W) linear RGB; `motion` (2, H, W) [px, x right, y down]
     over the exposure, `motion_next` and `motion_previous` to the neighbour frames' sharp instants (NaN where the
     point is behind the camera then); `depth` (1, H, W) [scene units], inf where nothing is; `alpha` over the exposure
-    and `sharp_alpha` (1, H, W); `mesh_id` and `face_id` (1, H, W) int64, -1 where nothing is; `baseline_NAME`
-    (3, H, W) linear RGB for each filter that the data set was made with; `index`; and `meta`, the frame's metadata as
-    JSON text, which the default collate of a DataLoader keeps as a list of str.
+    and `sharp_alpha` (1, H, W); `shadow` (1, H, W), the share of the lamps' light that no shadow takes away over the
+    exposure, 1 in frames without lamps, so that a batch may mix them; `mesh_id` and `face_id` (1, H, W) int64, -1 where
+    nothing is; `baseline_NAME` (3, H, W) linear RGB for each filter that the data set was made with; `index`; and
+    `meta`, the frame's metadata as JSON text, which the default collate of a DataLoader keeps as a list of str.
 
     Files are opened when an item is asked for; the object is small and can travel to worker processes.
 
@@ -98,6 +100,8 @@ class BlurDataset(Dataset[dict[str, Any]]):
             for key in self.keys:
                 if key in IDS:
                     result[key] = torch.from_numpy(parts["data"][IDS[key]].astype(np.int64)).unsqueeze(0) - 1
+                elif key == "shadow" and key not in parts["data"]:
+                    result[key] = torch.ones(1, *parts["data"]["A"].shape)
                 else:
                     result[key] = _stack(parts, *self.planes[key])
         except KeyError as error:

@@ -18,7 +18,7 @@ from typing import Any
 
 import torchblur as tb
 from datagen.scenes import Plan
-from datagen.spec import NOT_IN_THE_BYTES, DatasetSpec, SpecError
+from datagen.spec import ADDED_LATER, NOT_IN_THE_BYTES, DatasetSpec, SpecError
 from datagen.writer import FOLDERS, TEMPORARY_PREFIX, write_atomically
 
 try:
@@ -208,6 +208,8 @@ def _run_record(plan: Plan) -> dict[str, Any]:
         "spec": plan.spec.model_dump(),
         "assets_sha256": plan.assets_sha256,
         "asset_names": list(plan.asset_names),
+        "texture_names": list(plan.texture_names),
+        "background_names": list(plan.background_names),
         "config_sha256": plan.config_sha256,
         "torchblur_version": tb.__version__,
     }
@@ -217,13 +219,18 @@ def _run_record(plan: Plan) -> dict[str, Any]:
 def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) -> list[str]:
     """Return one line for each field in which a folder's data differ from what is asked for."""
     problems = []
-    was_spec, now_spec = {"storage": "folder"} | found["spec"], wanted["spec"]
+    as_before = {"storage": "folder"} | {name: DatasetSpec.model_fields[name].default for name in ADDED_LATER}
+    was_spec, now_spec = as_before | found["spec"], wanted["spec"]
     fixed = set(was_spec) | set(now_spec)
     fixed -= set(NOT_IN_THE_BYTES)
     fixed |= {"storage"} | ({"frames_per_shard"} if now_spec["storage"] == was_spec["storage"] == "shards" else set())
     for name in sorted(fixed):
         was, now = was_spec.get(name), now_spec.get(name)
         if was != now:
+            problems.append(f"{name}: expected {was!r} as in {folder}, got {now!r}")
+    for name in ("textures", "backgrounds"):
+        was, now = was_spec.get(name), now_spec[name]
+        if (was is None) != (now is None):
             problems.append(f"{name}: expected {was!r} as in {folder}, got {now!r}")
     if was_spec.get("count", 0) > now_spec["count"]:
         had, asked = was_spec["count"], now_spec["count"]

@@ -33,6 +33,9 @@ class Moving(Protocol):
     def at(self, times_s: Tensor) -> Tensor:
         """Return (N, V, 3) world positions at times (N,) [s]."""
 
+    def resting(self) -> Tensor:
+        """Return (V, 3) places before any motion."""
+
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times inside the window at which the velocity jumps."""
 

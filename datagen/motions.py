@@ -94,6 +94,10 @@ class RigidBody:
         """Return (N, V, 3) float64 world positions at times (N,) [s]. Source: ours."""
         return self.motion.place(self.vertices, times_s)
 
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices before any motion."""
+        return self.vertices
+
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times inside the window at which the velocity jumps: none."""
         return []
@@ -124,6 +128,10 @@ class PlayedVertices:
         index = first.long()
         return self.positions[index] * (1 - share) + self.positions[index + 1] * share
 
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices of the first frame."""
+        return self.positions[0]
+
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""
         first = math.floor((open_s + self.start_s) * self.rate_hz) + 1
@@ -147,6 +155,10 @@ class CarriedVertices:
     def at(self, times_s: Tensor) -> Tensor:
         """Return (N, V, 3) float64 world positions at times (N,) [s]. Source: ours."""
         return self.motion.place(self.sequence.at(times_s), times_s)
+
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices of the first frame, before the whole body moves."""
+        return self.sequence.resting()
 
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
         """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""
@@ -200,6 +212,15 @@ class CameraPath:
             far=self.far,
         )
         return camera.world_to_clip[: len(times)]
+
+
+def px_per_unit(camera: CameraPath, height: int) -> float:
+    """Return the screen size [px] of a scene unit at the camera's target at time 0, for an image `height` high [px].
+
+    Source: the pinhole camera.
+    """
+    distance = math.dist(camera.eye.at(torch.zeros(1))[0].tolist(), camera.target.at(torch.zeros(1))[0].tolist())
+    return height / (2 * distance * math.tan(math.radians(camera.fov_y_deg) / 2))
 
 
 def turns(axis: Vector, angles_rad: Tensor) -> Tensor:

@@ -1,6 +1,6 @@
 """Page: a data set's report as one HTML file that needs nothing else and loads nothing.
 
-Before: checks.py, dataset.py, report.py, pictures.py.  After: commands.py.
+Before: checks.py, dataset.py, report.py, pictures.py, run_log.py.  After: commands.py.
 Its content policy lets only this file's own style and script run, by their checksums; every text is escaped.
 Large data sets are told of by LOOKED_AT frames, evenly chosen, which the page says.
 """
@@ -15,6 +15,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timezone
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -26,10 +27,11 @@ from datagen.dataset import BlurDataset
 from datagen.entries import read_entries
 from datagen.listed_files import read_listed_file
 from datagen.pictures import decode_png, encode_png, shrink
-from datagen.report import motion_colours
+from datagen.report import grey_picture, motion_colours
+from datagen.run_log import read_log
 from datagen.writer import frame_paths, write_atomically
 
-LOOKED_AT, SHOWN, WORST, LISTED = 200, 8, 4, 100
+LOOKED_AT, SHOWN, WORST, LISTED, RUNS_SHOWN = 200, 8, 4, 100, 12
 PICTURE_PX = 360
 BLUR_EDGES_PX = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, math.inf)
 STYLE = """
@@ -82,16 +84,18 @@ def write_page(folder: str | Path, out: str | Path) -> Path:
     """
     status = read_status(folder)
     entries = read_entries(folder)
-    dataset = BlurDataset(folder, keys=("motion", "depth"))
+    dataset = BlurDataset(folder, keys=("motion", "depth", "shadow"))
     looks = [look_at_frame(dataset, item) for item in _evenly(len(dataset), LOOKED_AT)]
     worst = sorted(looks, key=lambda look: (-look.blur_px, look.index))[:WORST]
     parts = [
         f"<h1>{escape(str(Path(folder).resolve().name))}</h1>",
         _counts(status),
+        _throughput(folder),
         _failures(status),
         f"<h2>Distributions</h2><p>Of {len(looks)} frames, evenly chosen from {len(dataset)}.</p>",
         _charts(looks),
-        "<h2>Samples</h2><p>Left of the slider sharp, right of it blurred; beside it the motion over the exposure.</p>",
+        "<h2>Samples</h2><p>Left of the slider sharp, right of it blurred; beside it the motion over "
+        "the exposure, and where there are lamps, the share of their light that no shadow takes away.</p>",
         *(_figure(dataset, looks[k], entries[looks[k].index]) for k in _evenly(len(looks), SHOWN)),
         "<h2>Longest blur</h2>",
         *(_figure(dataset, look, entries[look.index]) for look in worst),
@@ -113,7 +117,7 @@ def look_at_frame(dataset: BlurDataset, item: int) -> Look:
     depth = frame["depth"].double().numpy()
     depth = depth[np.isfinite(depth) & (depth > 0)]
     effects = tuple(name for name, e in meta.get("plan", {}).get("effects", {}).items() if e["simulated"])
-    knots = [*meta["meshes"], meta["camera"]]
+    knots = [*meta["meshes"], meta["camera"], *meta.get("lamps", ())]
     return Look(
         item=item,
         index=int(frame["index"]),
@@ -143,6 +147,23 @@ def _counts(status: Status) -> str:
     return (
         "<table>" + "".join(f"<tr><th>{escape(k)}</th><td>{escape(v)}</td></tr>" for k, v in rows.items()) + "</table>"
     )
+
+
+def _throughput(folder: str | Path) -> str:
+    """Return how fast the runs made frames, the last RUNS_SHOWN of them as a table, or nothing if none is known."""
+    notes, unread = read_log(folder)
+    lines = []
+    for note in notes[-RUNS_SHOWN:]:
+        when = datetime.fromtimestamp(note.started_s, timezone.utc).strftime("%Y-%m-%d %H:%M UTC")
+        cells = (when, note.part or "all", note.workers, note.made, note.failed, f"{note.seconds:.1f}")
+        cells = (*cells, f"{note.pairs_per_s:.3g}")
+        lines.append("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in cells) + "</tr>")
+    heads = ("started", "slice", "workers", "pairs made", "failed", "seconds", "pairs per second")
+    table = f"<table><tr>{''.join(f'<th>{head}</th>' for head in heads)}</tr>{''.join(lines)}</table>"
+    made, seconds = sum(note.made for note in notes), sum(note.seconds for note in notes)
+    told = f"{made} pairs in {seconds:.1f} s of {len(notes)} runs; runs that were killed are not in it."
+    bad = f"<p class='bad'>{unread} lines of the log of runs cannot be read.</p>" if unread else ""
+    return (f"<h2>Throughput</h2><p>{told}</p>{table}" if notes else "") + bad
 
 
 def _failures(status: Status) -> str:
@@ -183,15 +204,18 @@ def _chart(title: str, rows: Sequence[tuple[str, int]]) -> str:
 
 
 def _figure(dataset: BlurDataset, look: Look, entry: dict[str, Any]) -> str:
-    """Return one frame: sharp and blurred under a slider, and its motion."""
+    """Return one frame: sharp and blurred under a slider, its motion, and the shadows that fall if any."""
     files = [read_listed_file(dataset.folder, entry, frame_paths(look.index)[kind]) for kind in ("sharp", "blur")]
     sharp, blur = (_small(decode_png(data)) for data in files)
-    motion = _small(motion_colours(dataset[look.item]["motion"].permute(1, 2, 0)))
+    planes = dataset[look.item]
+    motion = _small(motion_colours(planes["motion"].permute(1, 2, 0)))
+    shadow = _small(grey_picture(planes["shadow"][0].clamp(0, 1))) if "shadows" in look.effects else None
     name, effects = f"frame {look.index}", escape(", ".join(look.effects))
     return (
         f'<figure><span class="pair">{_image(sharp, f"{name}, sharp")}{_image(blur, f"{name}, blurred", "over")}'
         f'<input type="range" min="0" max="100" value="50" aria-label="{name}"></span> '
         + _image(motion, f"{name}, motion")
+        + (_image(shadow, f"{name}, shadow") if shadow is not None else "")
         + f"<figcaption>{name}: blur up to {look.blur_px:.1f} px; {effects}</figcaption></figure>"
     )
 

@@ -131,6 +131,18 @@ def light(shape: Shape, colours: Tensor, two_sided: bool = False) -> Tensor:
     return colours * amount.unsqueeze(-1)
 
 
+def lit_color(shape: Shape, colours: Tensor, is_lit: bool, two_sided: bool = False) -> Tensor:
+    """Return face colours as float32: as they are for lamps to light them, or with a fixed light painted in.
+
+    Args:
+        shape, colours, two_sided: as for `light`.
+        is_lit: whether lamps light the shape.
+
+    Source: ours.
+    """
+    return (colours if is_lit else light(shape, colours, two_sided)).to(torch.float32)
+
+
 def smooth_noise(points: Tensor, rng: np.random.Generator) -> Tensor:
     """Return (N,) values in [0, 1] of a random smooth function at points (N, 3): a few waves, summed.
 

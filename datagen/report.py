@@ -1,7 +1,8 @@
 """Report: a contact sheet of a data set, to be looked at, and what its frames called for.
 
 Before: dataset.py, colour.py, pictures.py.  After: runs.py.
-Symbols: H, W size of a cell. One row a frame: sharp, blurred, what filters make of it if any, motion, depth, alpha.
+Symbols: H, W size of a cell. One row a frame: sharp, blurred, what filters make of it if any, motion, depth, alpha, and
+shadow if any frame has one.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from torch import Tensor
 
 from datagen.colour import bytes_from_linear
 from datagen.dataset import BlurDataset
+from datagen.entries import read_entries
 from datagen.pictures import encode_png, shrink, write_labels
 from datagen.writer import write_atomically
 
@@ -28,6 +30,7 @@ MAX_ROWS = 12
 MAX_CELL_PX = 256
 GAP_PX = 6
 TITLE_PX = 18
+LETTER_PX = 6  # width of a letter of the labels, about
 PAPER = 245  # grey of the sheet
 
 
@@ -40,7 +43,8 @@ def write_contact_sheet(folder: str | Path) -> Path:
     Source: ours.
     """
     baselines = [key for key in BlurDataset(folder, keys=()).planes if key.startswith(BASELINE)]
-    columns = (*COLUMNS[:2], *baselines, *COLUMNS[2:])
+    shadow = ("shadow",) if any("shadows" in entry["effects"] for entry in read_entries(folder).values()) else ()
+    columns = (*COLUMNS[:2], *baselines, *COLUMNS[2:], *shadow)
     dataset = BlurDataset(folder, keys=columns)
     n_rows = min(MAX_ROWS, len(dataset))
     chosen = sorted({round(k * (len(dataset) - 1) / max(n_rows - 1, 1)) for k in range(n_rows)})
@@ -58,8 +62,10 @@ def write_contact_sheet(folder: str | Path) -> Path:
         kinds = " ".join(str(v) for k, v in sorted(meta["scene"].items()) if isinstance(v, str))
         texts = {"sharp": f"{frame['index']}", "blurred": kinds, "motion": f"up to {fastest:.1f} px"}
         texts |= {"depth": "near is bright", "alpha": "white is opaque"}
+        texts |= {"shadow": "white: no shadow"} if shadow else {}
         places = {name: GAP_PX + k * (size[0] + GAP_PX) for k, name in enumerate(columns)}
-        labels += [(places[name], top + size[1] + 2, text) for name, text in texts.items()]
+        fits = size[0] // LETTER_PX  # a longer text would run into the next one
+        labels += [(places[name], top + size[1] + 2, text[:fits]) for name, text in texts.items()]
         top += size[1] + TITLE_PX
     labels += [(x, 3, name.removeprefix(BASELINE)) for name, x in places.items()]
     sheet = np.full((top + 2, rows[0].shape[1], 3), PAPER, np.uint8)
@@ -100,8 +106,8 @@ def frame_pictures(frame: dict[str, Tensor]) -> dict[str, np.ndarray]:
     images = [key for key in frame if key in ("sharp", "blurred") or key.startswith(BASELINE)]
     return {key: bytes_from_linear(frame[key].permute(1, 2, 0)).numpy() for key in images} | {
         "motion": motion_colours(frame["motion"].permute(1, 2, 0)),
-        "depth": _grey(shade),
-        "alpha": _grey(frame["alpha"][0].clamp(0, 1)),
+        "depth": grey_picture(shade),
+        **{name: grey_picture(frame[name][0].clamp(0, 1)) for name in ("alpha", "shadow") if name in frame},
     }
 
 
@@ -124,8 +130,8 @@ def motion_colours(motion_px: Tensor) -> np.ndarray:
     return (rgb * 255).round().to(torch.uint8).numpy()
 
 
-def _grey(plane: Tensor) -> np.ndarray:
-    """Return a (H, W) plane in [0, 1] as a grey picture."""
+def grey_picture(plane: Tensor) -> np.ndarray:
+    """Return a (H, W) plane in [0, 1] as a grey (H, W, 3) uint8 picture. Source: ours."""
     return (plane * 255).round().to(torch.uint8).unsqueeze(-1).expand(-1, -1, 3).numpy()
 
 

@@ -7,11 +7,10 @@ Source: ours.
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 
 from datagen.animated import ANIMATED_SUFFIXES, AnimatedAsset, is_animated, load_animated
-from datagen.assets import MESH_SUFFIXES, Roster, load_mesh, tensors_sha256
+from datagen.assets import MESH_SUFFIXES, Roster, files_under, load_mesh, tensors_sha256
 from datagen.formats import MeshError
 from datagen.sequences import CACHE_SUFFIX, survey_sequence
 from datagen.usd_files import USD_SUFFIXES, vet_usd
@@ -32,7 +31,7 @@ def survey_meshes(folder: str | Path) -> Roster:
     Source: ours.
     """
     names, refused, digest = [], [], hashlib.sha256()
-    for name in _files_under(folder):
+    for name in files_under(folder):
         suffix = Path(name).suffix.lower()
         if suffix in UNREAD_SUFFIXES:
             refused.append(
@@ -86,11 +85,3 @@ def _content(path: Path) -> bytes:
         return bytes.fromhex(survey_sequence(path).sha256)
     asset = load_mesh(str(path))
     return tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity)
-
-
-def _files_under(folder: str | Path) -> list[str]:
-    """Return the relative paths of all files under a folder, sorted; links to folders are not followed."""
-    found = []
-    for root, _, files in os.walk(folder, followlinks=False):
-        found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]
-    return sorted(found)

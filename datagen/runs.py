@@ -1,6 +1,7 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py.  After: commands.py.
+Before: samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py, run_log.py.
+After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
 
@@ -17,8 +18,9 @@ from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.ray_executor import check_ray, run_ray
 from datagen.report import effect_shares, write_contact_sheet
+from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
-from datagen.scenes import Plan, plan_from_json, survey_assets
+from datagen.scenes import Plan, plan_from_json, survey_plan
 from datagen.sensor import photograph
 from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
 from datagen.spec import DatasetSpec, SpecError
@@ -84,16 +86,16 @@ def generate(
     spec = settle_storage(spec, Path(out))
     if part is not None and spec.storage != "shards":
         raise SpecError([f"storage: expected shards for a slice, got {spec.storage}"])
-    roster = survey_assets(spec)
-    plan = Plan(spec, roster.names, roster.sha256)
-    with locked_folder(out, part) as folder:
+    plan, refused = survey_plan(spec)
+    part_text = f"{part.number}/{part.of}" if part else ""
+    with locked_folder(out, part) as folder, logged_run(folder, max(workers, 1), part_text) as note:
         run = _begin(folder, plan, part)
         entries, kept = run.holdings.entries, len(run.holdings.entries)
         repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
         failed = []
         with Progress(run.total, kept, is_quiet) as progress:
-            if roster.refused:
-                progress.say(f"{len(roster.refused)} asset files refused, listed at the end")
+            if refused:
+                progress.say(f"{len(refused)} asset files refused, listed at the end")
             for line in repaired:
                 progress.say(line)
             text = plan.to_json()
@@ -107,6 +109,7 @@ def generate(
             for outcome in outcomes:
                 made, lost = _frames_of(outcome, run)
                 failed += lost
+                note.made, note.failed = note.made + len(made), note.failed + len(lost)
                 for index, reason in lost:
                     progress.say(f"failed frame {index}: {reason}")
                     progress.step(is_done=False)
@@ -122,10 +125,10 @@ def generate(
         if run.task is make_frame:
             write_manifest(folder, entries)
         failed.sort()
-        _write_failures(folder, failed, list(roster.refused), part)
+        _write_failures(folder, failed, list(refused), part)
         sheet = write_contact_sheet(folder) if entries and part is None else None
     made_count, shares = len(entries) - kept, effect_shares(entries.values())
-    return RunResult(folder, made_count, kept, tuple(failed), roster.refused, sheet, tuple(repaired), shares)
+    return RunResult(folder, made_count, kept, tuple(failed), refused, sheet, tuple(repaired), shares)
 
 
 def make_frame(plan_json: str, folder: str, index: int) -> str:

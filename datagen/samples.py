@@ -15,7 +15,7 @@ from torch import Tensor
 
 import torchblur as tb
 from datagen.baselines.filters import filter_instant
-from datagen.clips import Clip, Exposure, expose, freeze
+from datagen.clips import Clip, Exposure, expose, freeze, knot_times
 from datagen.knots import MAX_SEGMENTS, TOLERANCE_PX
 from datagen.scenes import Plan, build_clip, plan_from_json
 
@@ -34,6 +34,12 @@ UNITS = {
     "time": "seconds from the start of the clip",
     "camera": "world to clip, OpenGL convention, column vectors, at equal steps from opening to closing",
 }
+LIGHT_UNITS = {
+    "shadow": "share of the lamps' light due to what the pixel sees over the exposure that no shadow takes away; "
+    "1 where none is due",
+    "lamps": "places in scene units at equal steps from opening to closing; power in W/sr, of a directional one, which "
+    "shines everywhere from position to target, in W/m^2 of what faces it; ambient as radiance",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,6 +55,7 @@ class Sample:
     mesh_id: Tensor  # (H, W) int64, -1 where nothing is
     face_id: Tensor  # (H, W) int64, -1 where nothing is
     coverage: Tensor  # (H, W, M) share of the exposure
+    shadow: Tensor | None  # (H, W) share of the light due that arrives; none without lamps
     meta: dict[str, Any]  # JSON values
     baselines: dict[str, Tensor] = field(default_factory=dict)  # by filter: (H, W, 3) linear RGB
     pictures: dict[str, Tensor] | None = None  # `sharp` and `blur`, (H, W, 3) uint8; none: on the sRGB curve
@@ -119,6 +126,7 @@ def render_sample(clip: Clip, plan: Plan, index: int, frame: int) -> Sample:
         mesh_id=now.mesh_id,
         face_id=now.face_id,
         coverage=blurred.coverage,
+        shadow=blurred.shadow,
         meta=_metadata(clip, exposure, plan, index, times)
         | {"counts": dict(sorted(blurred.counts.items())), "plan": blurred.plan.to_dict(), "baselines": settings},
         baselines=baselines,
@@ -140,7 +148,8 @@ def _metadata(clip: Clip, exposure: Exposure, plan: Plan, index: int, times: Fra
         for mesh, knots in zip(scene.meshes, exposure.mesh_knots, strict=True)
     ]
     camera = exposure.camera_knots
-    return {
+    light = {"lamps": _lamp_notes(clip, exposure), "ambient": list(clip.ambient)} if clip.lamps else {}
+    return light | {
         "format": 1,
         "index": index,
         "clip": clip_number,
@@ -173,8 +182,17 @@ def _metadata(clip: Clip, exposure: Exposure, plan: Plan, index: int, times: Fra
         "chord_tolerance_px": TOLERANCE_PX,
         "max_segments": MAX_SEGMENTS,
         "scene": clip.notes,
-        "units": UNITS,
+        "units": UNITS | (LIGHT_UNITS if clip.lamps else {}),
     }
+
+
+def _lamp_notes(clip: Clip, exposure: Exposure) -> list[dict[str, Any]]:
+    """Return the lamps during an exposure as JSON values."""
+    return [
+        lamp.notes(knot_times(knots.segments, exposure.open_s, exposure.close_s))
+        | {"segments": knots.segments, "chord_error_px": knots.error_px, "limit_reached": knots.limit_reached}
+        for lamp, knots in zip(clip.lamps, exposure.lamp_knots, strict=True)
+    ]
 
 
 @functools.lru_cache(maxsize=4)

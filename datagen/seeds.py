@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 # Each kind of decision draws from its own stream, so that a new kind moves none of the old ones.
-STREAMS = ("stage", "camera", "cast", "motion", "colour", "backdrop", "sensor", "noise")
+STREAMS = ("stage", "camera", "cast", "motion", "colour", "backdrop", "sensor", "noise", "lamps", "pictures")
 
 
 def open_stream(seed: int, stream: str, clip: int) -> np.random.Generator:

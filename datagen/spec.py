@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -23,7 +23,8 @@ else:
 SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc")
 BASELINES = ("directional", "mcguire2012", "guertin2014", "guertin2015")  # in baselines/filters.py, which needs torch
 # A longer run extends a shorter one; a folder's place is not its content; storage does not change a frame's files.
-NOT_IN_THE_BYTES = ("count", "assets", "storage", "frames_per_shard")
+NOT_IN_THE_BYTES = ("count", "assets", "textures", "backgrounds", "storage", "frames_per_shard")
+ADDED_LATER = ("lighting",)  # fields whose default means what data sets were before these fields: they stay the same
 
 
 class SpecError(ValueError):
@@ -48,6 +49,10 @@ class DatasetSpec(BaseModel):
         exposure: share of the frame time 1/fps during which the shutter is open, in (0, 1].
         rays_per_pixel: rays inside each pixel, 1 = its centre.
         sequence_fps: at what rate the frames of a sequence are played [Hz]; an animated file has its own times.
+        lighting: `painted` (a fixed light is painted into colours), `lamps` (moving lamps light the clips, which have
+            a floor or walls for their shadows) or `mixed`: one or the other, clip by clip.
+        textures: a folder of pictures that floors, walls and half of the bodies wear.
+        backgrounds: a folder of pictures of which one is behind each clip, instead of walls and skies.
         baselines: filters whose images are stored beside the exact one: names from BASELINES, between commas.
         storage: `folder` (a file for each thing), `shards` (tar files of many frames, as WebDataset has them) or
             `auto`: a folder below 1,000 frames.
@@ -76,6 +81,9 @@ class DatasetSpec(BaseModel):
     exposure: float = Field(default=0.5, gt=0, le=1, allow_inf_nan=False)
     rays_per_pixel: int = Field(default=4, ge=1, le=4096)
     sequence_fps: float = Field(default=24.0, gt=0, le=1e6, allow_inf_nan=False)
+    lighting: Literal["painted", "lamps", "mixed"] = "painted"
+    textures: str | None = None
+    backgrounds: str | None = None
     storage: Literal["auto", "folder", "shards"] = "auto"
     frames_per_shard: int = Field(default=100, ge=1, le=10**5)
     sensor: Literal["off", "srgb", "gamma"] = "off"
@@ -90,6 +98,13 @@ class DatasetSpec(BaseModel):
     sensor_sharp_noise: bool = False
 
     baselines: str = ""
+
+    @field_validator("textures", "backgrounds")
+    @classmethod
+    def _picture_folders_exist(cls, text: str | None, info: ValidationInfo) -> str | None:
+        if text is not None and not Path(text).is_dir():
+            raise ValueError(f"{info.field_name}: expected a folder of pictures, got {text!r}, which is no folder")
+        return text
 
     @field_validator("baselines")
     @classmethod
@@ -148,7 +163,8 @@ class DatasetSpec(BaseModel):
 
         Source: ours.
         """
-        fields = {k: v for k, v in self.model_dump().items() if k not in NOT_IN_THE_BYTES}
+        left_out = {k for k in ADDED_LATER if getattr(self, k) == type(self).model_fields[k].default}
+        fields = {k: v for k, v in self.model_dump().items() if k not in left_out.union(NOT_IN_THE_BYTES)}
         text = json.dumps(fields | {"assets_sha256": assets_sha256}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 

@@ -1,6 +1,6 @@
 """Stages: the camera and its way, and what stands behind the actors.
 
-Before: motions.py, shapes.py, patterns.py, clips.py.  After: scenes.py.
+Before: motions.py, shapes.py, patterns.py, clips.py.  After: lit_stages.py, scenes.py.
 Symbols: D distance of the eye from the origin, about which the actors play; the view there is VIEW_HEIGHT high.
 Speeds are drawn as shares of the image height that are crossed in REFERENCE_S, and so do not depend on the
 specification's fps and exposure: a longer exposure blurs more, as it does in a real camera.
@@ -16,8 +16,9 @@ import torch
 from torch import Tensor
 
 from datagen.clips import Actor
+from datagen.lamps import Lamp
 from datagen.motions import CameraPath, Path, RigidBody, RigidMotion, Sway, Vector
-from datagen.patterns import light, paint, smooth_noise
+from datagen.patterns import lit_color, paint, smooth_noise
 from datagen.shapes import Shape, box, sheet
 
 VIEW_HEIGHT = 4.0  # [scene units] seen at the origin, from top to bottom
@@ -36,6 +37,8 @@ class Stage:
     actors: tuple[Actor, ...]  # the backdrop's meshes, all still
     background: Tensor  # (3,) or (H, W, 3) linear
     kinds: dict[str, str]  # what was chosen, for the metadata
+    lamps: tuple[Lamp, ...] = ()
+    ambient: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 def speed_of(share_per_exposure: float) -> float:
@@ -46,19 +49,22 @@ def speed_of(share_per_exposure: float) -> float:
     return share_per_exposure * VIEW_HEIGHT / REFERENCE_S
 
 
-def choose_camera(rng: np.random.Generator, aspect: float) -> tuple[CameraPath, str]:
+def choose_camera(
+    rng: np.random.Generator, aspect: float, pitch_rad: tuple[float, float] = (-0.03, 0.3)
+) -> tuple[CameraPath, str]:
     """Return a camera path and its kind. A tall image gets more distance, so that the actors stay inside.
 
     Args:
         rng: stream `camera`.
         aspect: width / height.
+        pitch_rad: from where to where the camera may look down.
 
     Source: ours.
     """
     kind = str(rng.choice(CAMERA_KINDS, p=CAMERA_WEIGHTS))
     fov_deg = float(rng.uniform(32, 58))
     distance = VIEW_HEIGHT / 2 / math.tan(math.radians(fov_deg) / 2) / min(1.0, max(aspect, 0.5))
-    yaw, pitch = float(rng.uniform(-0.45, 0.45)), float(rng.uniform(-0.03, 0.3))
+    yaw, pitch = float(rng.uniform(-0.45, 0.45)), float(rng.uniform(*pitch_rad))
     away = (math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch))
     right = (math.cos(yaw), 0.0, -math.sin(yaw))
     eye = tuple(distance * c for c in away)
@@ -122,13 +128,13 @@ def choose_stage(
         half = (3.4 + 0.5 * distance, 3.1, 1.4 + distance)
         shape = box(10, half)
         inside = Shape(shape.vertices, shape.faces.flip(1), shape.cell_uv, True)
-        actors = (_still("room", inside, paint(inside, pair, _quiet(rng), rng)),)
+        actors = (still("room", inside, paint(inside, pair, quiet(rng), rng)),)
     elif kind == "wall":
         shape = sheet(32, 0.0, 0.7).scaled((12.0, 12.0, 1.0))  # beyond the view from every eye
-        actors = (_still("wall", shape, paint(shape, pair, _quiet(rng), rng), (0.0, 0.0, -3.2)),)
+        actors = (still("wall", shape, paint(shape, pair, quiet(rng), rng), (0.0, 0.0, -3.2)),)
     elif kind == "ground":
-        shape = _laid(sheet(26, 0.0, 1.0)).scaled((11.0, 1.0, 11.0))
-        actors = (_still("ground", shape, paint(shape, pair, _quiet(rng), rng), (0.0, -1.75, -4.0)),)
+        shape = laid(sheet(26, 0.0, 1.0)).scaled((11.0, 1.0, 11.0))
+        actors = (still("ground", shape, paint(shape, pair, quiet(rng), rng), (0.0, -1.75, -4.0)),)
     if kind == "clouds":
         background = cloud_image(rng, main, second, size)
     elif kind == "flat":
@@ -169,8 +175,8 @@ def _pixel_places(size: tuple[int, int]) -> tuple[Tensor, Tensor]:
     return x.expand(height, width), y[:, None].expand(height, width)
 
 
-def _quiet(rng: np.random.Generator) -> str:
-    """Return a pattern for large surfaces."""
+def quiet(rng: np.random.Generator) -> str:
+    """Return a pattern for large surfaces. Source: ours."""
     return str(
         rng.choice(
             ("checker", "stripes", "bands", "noise", "patches", "gradient"), p=(0.3, 0.14, 0.12, 0.2, 0.12, 0.12)
@@ -178,14 +184,24 @@ def _quiet(rng: np.random.Generator) -> str:
     )
 
 
-def _still(name: str, shape: Shape, colours: Tensor, place: Vector = (0.0, 0.0, 0.0)) -> Actor:
-    """Return an actor that never moves."""
+def still(name: str, shape: Shape, colours: Tensor, place: Vector = (0.0, 0.0, 0.0), is_lit: bool = False) -> Actor:
+    """Return an actor that never moves.
+
+    Args:
+        name: of the actor.
+        shape: what it is.
+        colours: (F, 3) linear, without light.
+        place: of the shape's origin [scene units].
+        is_lit: whether lamps light it; otherwise a fixed light is painted in.
+
+    Source: ours.
+    """
     body = RigidBody(shape.vertices, RigidMotion(Path(place)))
-    return Actor(name, shape.faces, light(shape, colours, two_sided=True).to(torch.float32), body)
+    return Actor(name, shape.faces, lit_color(shape, colours, is_lit, two_sided=True), body, is_lit=is_lit)
 
 
-def _laid(shape: Shape) -> Shape:
-    """Return a sheet of the x-y plane turned into the x-z plane, facing up."""
+def laid(shape: Shape) -> Shape:
+    """Return a sheet of the x-y plane turned into the x-z plane, facing up. Source: ours."""
     x, y, z = shape.vertices.unbind(-1)
     return Shape(torch.stack([x, z, -y], -1), shape.faces, shape.cell_uv, shape.is_closed)
 

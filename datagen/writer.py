@@ -2,8 +2,8 @@
 
 Before: samples.py.  After: manifest.py and shards.py list what is finished; dataset.py reads with `decode_exr`.
 Symbols: H, W image size. Parts of the EXR, ZIP-compressed, which carries a checksum:
-`sharp` R G B A and `blurred` R G B in half; `data` in float32 (ids in uint32); `coverage` one float32 channel a mesh;
-`baseline.NAME` R G B in half for each filter that was asked for.
+`sharp` R G B A and `blurred` R G B in half; `data` in float32 (ids in uint32), with `shadow` where lamps shine;
+`coverage` one float32 channel a mesh; `baseline.NAME` R G B in half for each filter that was asked for.
 """
 
 from __future__ import annotations
@@ -119,6 +119,7 @@ def sample_parts(sample: Sample) -> dict[str, dict[str, np.ndarray]]:
     data = {f"{name}.{c}": _float(value[..., k]) for name, value in motions.items() for k, c in enumerate("uv")}
     data |= {"Z": _float(sample.depth_view), "A": _float(sample.blurred[..., 3])}
     data |= {"id.mesh": _id(sample.mesh_id), "id.face": _id(sample.face_id)}
+    data |= {} if sample.shadow is None else {"shadow": _float(sample.shadow)}
     parts = {
         "sharp": {c: _half("sharp", sample.sharp[..., k]) for k, c in enumerate("RGBA")},
         "blurred": {c: _half("blurred", sample.blurred[..., k]) for k, c in enumerate("RGB")},

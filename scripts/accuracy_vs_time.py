@@ -5,13 +5,15 @@
 Writes results.json, a plot of error against time for each scene and one of all, a sheet of images, and index.html,
 which holds all of them and opens offline. A scene is measured as a whole, its methods taking turns, and stored when it
 is done: an interrupted run goes on with the next scene. Times are medians of CPU times of a single thread from the
-scene to the image, the sharp image that a filter needs included. Errors are against the exact frame; the frame's own is
-judged by the mean of many sharp images, which shares no interval with it and is itself wrong by about 1 / N an event.
+scene to the image, the sharp image that a filter needs included; scenes are float32, so that whatever has a compiled
+path takes it. Errors are against the exact frame; the frame's own is judged by the mean of many sharp images, which
+shares no interval with it and is itself wrong by about 1 / N an event.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import statistics
 import sys
@@ -22,6 +24,7 @@ from typing import Any
 
 import accuracy_page
 import filter_scenes
+import motion_scenes
 import paper_scenes
 import torch
 from torch import Tensor
@@ -36,6 +39,7 @@ RESULTS_NAME = "results.json"
 SCENES: dict[str, Callable[[int], tb.Scene]] = {
     **paper_scenes.SCENES,
     **filter_scenes.SCENES,
+    **motion_scenes.SCENES,
     "rotor": lambda size: filter_scenes.rotor(size, 77),  # not whole pairs of sectors: few even times would be exact
 }
 QUICK_SCENES = ("plank", "rotor", "pills")
@@ -47,11 +51,17 @@ TOLERANCES = (1e-1, 1e-2, 1e-3, 1e-4)
 TAPS = {"directional": (8, 32, 128), "mcguire2012": (5, 15, 45), "guertin2014": (9, 35, 99)}  # samples
 SHOWN = ("exact", "mean of 32", "stochastic 32", "directional 32", "mcguire2012 15", "guertin2014 35", "guertin2015")
 
-Method = Callable[[tb.Scene], Tensor]
+Method = Callable[[tb.Scene], Tensor | tb.Frame]  # (H, W, 3) linear RGB, or a frame
+
+
+def single(scene: tb.Scene) -> tb.Scene:
+    """Return a scene whose results are float32."""
+    meshes = [dataclasses.replace(mesh, vertices=mesh.vertices.to(torch.float32)) for mesh in scene.meshes]
+    return dataclasses.replace(scene, meshes=meshes)
 
 
 def methods(counts: tuple[int, ...]) -> dict[str, tuple[str, Method]]:
-    """Return {name: (family, what makes (H, W, 3) linear RGB of a scene)}."""
+    """Return {name: (family, what makes an image of a scene)}."""
     found: dict[str, tuple[str, Method]] = {"exact": ("exact", _rendered(tb.Accuracy.exact()))}
     found["linear"] = ("linear", _rendered(tb.Accuracy.linear()))
     for tolerance in TOLERANCES:
@@ -78,7 +88,7 @@ def methods(counts: tuple[int, ...]) -> dict[str, tuple[str, Method]]:
 
 def _rendered(accuracy: tb.Accuracy) -> Method:
     """Return what renders at an accuracy."""
-    return lambda scene: tb.render(scene, accuracy=accuracy).rgba[..., :3]
+    return lambda scene: tb.render(scene, accuracy=accuracy)
 
 
 def _filtered(name: str, samples: int) -> Method:
@@ -111,23 +121,38 @@ def errors(image: Tensor, reference: Tensor) -> dict[str, float]:
     return found | ({"psnr_db": float(tb.psnr(image, reference))} if mse else {})
 
 
+def warm_up(scene: tb.Scene) -> None:
+    """Run all that has to be compiled once, on a small scene."""
+    tb.render(scene)
+    tb.accumulate(scene, 1)
+    tb.stochastic(scene, 1)
+    tb.render_instant(scene)
+
+
 def measure(scene: tb.Scene, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a scene's record for results.json, and its images by method."""
+    begun = time.process_time()
     every = methods(tuple(settings["counts"]))
     images: dict[str, Tensor] = {}
     seconds: dict[str, list[float]] = {name: [] for name in every}
+    looks = 0
     for _ in range(settings["repeats"]):
         for name, (_, make) in every.items():
             start = time.process_time()
-            images[name] = make(scene)
+            made = make(scene)
             seconds[name].append(time.process_time() - start)
-    exact = images["exact"]
-    check = tb.accumulate(scene, settings["check_times"]).rgba[..., :3]
+            images[name] = made.rgba[..., :3] if isinstance(made, tb.Frame) else made
+            looks = made.counts["nodes"] if name == "exact" else looks
+    exact, times = images["exact"], settings["check_times"]
+    known = f"mean of {times}"
+    check = images[known] if known in images else tb.accumulate(scene, times).rgba[..., :3]
     rows = {
         name: {"family": family, "time_s": statistics.median(seconds[name]), **errors(images[name], exact)}
         for name, (family, _) in every.items()
     }
-    return {"check": errors(exact, check), "check_times": settings["check_times"], "methods": rows}, images
+    record = {"check": errors(exact, check), "check_times": times, "methods": rows}
+    record["looks_per_pixel"] = looks / (scene.camera.width * scene.camera.height)
+    return record | {"cpu_s": time.process_time() - begun}, images
 
 
 def read_results(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
@@ -162,8 +187,8 @@ def main(argv: list[str] | None = None) -> None:
             print(f"{k + 1}/{len(names)} {name}: kept", file=sys.stderr)
             continue
         print(f"{k + 1}/{len(names)} {name} ...", file=sys.stderr)
-        scene = SCENES[name](size)
-        tb.render(SCENES[name](16))  # the first run of anything is slow
+        scene = single(SCENES[name](size))
+        warm_up(single(SCENES[name](16)))
         record, images = measure(scene, settings)
         shown = {method: images[method] for method in SHOWN if method in images}
         sheet.write_bytes(accuracy_page.encode_sheet(shown))
@@ -172,6 +197,7 @@ def main(argv: list[str] | None = None) -> None:
         partial.write_text(json.dumps(results, indent=1), encoding="utf-8")
         partial.replace(place)
     page = accuracy_page.write_page(arguments.out, results)
+    print(f"{sum(r['cpu_s'] for r in results['scenes'].values()):.0f} s of CPU time in all", file=sys.stderr)
     print(page)
 
 

@@ -78,7 +78,7 @@ def compare(name: str, scene: tb.Scene) -> str:
     exact_s, frame = seconds(lambda: tb.render(scene))
     cells = []
     for n in AVERAGES:
-        average_s, average = seconds(lambda n=n: tb.accumulate(scene, n))
+        average_s, average = seconds(lambda n=n: tb.accumulate(scene, n, backend="torch"))
         rmse = float((average.rgba - frame.rgba).double().square().mean().sqrt())
         cells.append(f"{average_s / exact_s:.1f}x, {-20 * math.log10(max(rmse, 1e-12)):.0f} dB")
     counts = f"{frame.counts['prisms']:,} prisms, {frame.counts['intervals']:,} intervals"

@@ -33,11 +33,11 @@ Shape = tuple[Tensor, Tensor, Tensor]  # vertices (V, 3), faces (F, 3), uv (F, 3
 def plank(size: int = 256) -> tb.Scene:
     """Return a wooden plank, 12 triangles, that turns and tilts about its middle in one linear piece."""
     vertices, faces, uv = _box((1.7, 0.55, 0.08))
-    start = vertices @ (_turn((1, 0, 0), -35) @ _turn((0, 0, 1), 45)).T
-    end = vertices @ (_turn((1, 0, 0), -35) @ _turn((0, 0, 1), -45)).T
+    start = vertices @ (rotation((1, 0, 0), -35) @ rotation((0, 0, 1), 45)).T
+    end = vertices @ (rotation((1, 0, 0), -35) @ rotation((0, 0, 1), -45)).T
     motion = torch.stack([start, end + torch.tensor([0.12, 0.06, 0.0], dtype=torch.float64)])
-    look = _textured(_wood(max(8, size // 6), max(16, size // 2)))
-    return tb.Scene([tb.Mesh(motion, faces, look, name="plank", uv=uv)], _camera(size, size), BACKDROP)
+    look = textured(_wood(max(8, size // 6), max(16, size // 2)))
+    return tb.Scene([tb.Mesh(motion, faces, look, name="plank", uv=uv)], still_camera(size, size), BACKDROP)
 
 
 def chip(size: int = 256) -> tb.Scene:
@@ -45,22 +45,16 @@ def chip(size: int = 256) -> tb.Scene:
     vertices, faces, uv = _chip(128, 0.85, 0.12)
     poses = []
     for k in range(2):
-        turn = _turn((1, 0.25, 0.1), 50 + 60 * k) @ _turn((0, 1, 0), 60 * k)
+        turn = rotation((1, 0.25, 0.1), 50 + 60 * k) @ rotation((0, 1, 0), 60 * k)
         poses.append(vertices @ turn.T + torch.tensor([0.0, 0.25 - 0.5 * k, 0.0], dtype=torch.float64))
-    mesh = tb.Mesh(torch.stack(poses), faces, _textured(_chip_look(max(8, size // 2))), name="chip", uv=uv)
-    return tb.Scene([mesh], _camera(max(1, size // 2), size), BACKDROP)
+    mesh = tb.Mesh(torch.stack(poses), faces, textured(_chip_look(max(8, size // 2))), name="chip", uv=uv)
+    return tb.Scene([mesh], still_camera(max(1, size // 2), size), BACKDROP)
 
 
 def character(size: int = 256) -> tb.Scene:
     """Return a running figure of 14 parts and 8,512 triangles, each limb on its own way in one linear piece."""
-    start, end = _runner(0), _runner(1)
-    meshes = []
-    for k, (name, *_, length, radii, flat, (colour, other, across, along)) in enumerate(LIMBS):
-        vertices, faces, uv = _capsule(length, radii, flat)
-        motion = torch.stack([vertices @ turn.T + base for base, turn in (start[name], end[name])])
-        look = _textured(_cloth(max(8, size // 6), (colour, other), (across, along), seed=k))
-        meshes.append(tb.Mesh(motion, faces, look, name=name, uv=uv))
-    return tb.Scene(meshes, _camera(size, size), BACKDROP)
+    poses = [pose(float(end), (-0.1 + 0.25 * end, -0.15 + 0.06 * end)) for end in range(2)]
+    return tb.Scene(figure(size, poses), still_camera(size, size), BACKDROP)
 
 
 def transparent(size: int = 256) -> tb.Scene:
@@ -71,7 +65,7 @@ def transparent(size: int = 256) -> tb.Scene:
         return low + (high - low) * torch.rand(*shape, dtype=torch.float64, generator=random)
 
     meshes = []
-    for n, texture in ((160, None), (40, _rings(max(8, size // 12), 3))):
+    for n, texture in ((160, None), (40, rings(max(8, size // 12), 3))):
         place, shape = uniform(-1.5, 1.5, n, 1, 3), uniform(-0.42, 0.42, n, 3, 3)
         motion, bend = uniform(-0.3, 0.3, n, 1, 3), uniform(-0.3, 0.3, n, 3, 3)
         start, end = (place + shape).reshape(-1, 3), (place + shape + motion + bend).reshape(-1, 3)
@@ -79,7 +73,7 @@ def transparent(size: int = 256) -> tb.Scene:
         look = tb.Material(uniform(0.1, 1.0, n, 3), 0.5, texture=texture)
         faces = torch.arange(3 * n).reshape(n, 3)
         meshes.append(tb.Mesh(torch.stack([start, end]), faces, look, name="glass", uv=uv))
-    return tb.Scene(meshes, _camera(size, size), BACKDROP)
+    return tb.Scene(meshes, still_camera(size, size), BACKDROP)
 
 
 def swapping_quads(size: int = 256) -> tb.Scene:
@@ -99,10 +93,10 @@ def swapping_quads(size: int = 256) -> tb.Scene:
 
     going = torch.stack([sheet((-0.30, 0.18), 0.55, 1.0), sheet((-0.22, 0.24), 0.50, 9.0)])
     resting = sheet((0.25, -0.2), 0.6, 3.0)
-    warm = _textured(_stripes(max(8, size // 2), 8), (1.0, 0.5, 0.2))
-    cold = _textured(_rings(max(8, size // 2), 7), (0.2, 0.55, 1.0))
+    warm = textured(stripes(max(8, size // 2), 8), (1.0, 0.5, 0.2))
+    cold = textured(rings(max(8, size // 2), 7), (0.2, 0.55, 1.0))
     meshes = [tb.Mesh(going, faces, warm, name="going", uv=uv), tb.Mesh(resting, faces, cold, name="resting", uv=uv)]
-    return tb.Scene(meshes, _camera(size, size), (0.03, 0.03, 0.04))
+    return tb.Scene(meshes, still_camera(size, size), (0.03, 0.03, 0.04))
 
 
 SCENES: dict[str, Callable[[int], tb.Scene]] = {
@@ -114,17 +108,17 @@ SCENES: dict[str, Callable[[int], tb.Scene]] = {
 }
 
 
-def _camera(width: int, height: int) -> tb.Camera:
+def still_camera(width: int, height: int) -> tb.Camera:
     """Return a still camera 5 units in front of the origin, where it sees 4.1 units from top to bottom."""
     return tb.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y_deg=FOV_Y_DEG, width=width, height=height, near=0.5, far=20)
 
 
-def _textured(texture: np.ndarray, color: Sequence[float] = (1.0, 1.0, 1.0)) -> tb.Material:
+def textured(texture: np.ndarray, color: Sequence[float] = (1.0, 1.0, 1.0)) -> tb.Material:
     """Return an opaque material of one texture, not repeated."""
     return tb.Material(color, texture=texture, wrap="clamp")
 
 
-def _turn(axis: Sequence[float], degrees: float) -> Tensor:
+def rotation(axis: Sequence[float], degrees: float) -> Tensor:
     """Return the (3, 3) rotation about `axis`, counter-clockwise seen against it."""
     x, y, z = (math.radians(degrees) * np.asarray(axis, dtype=np.float64) / np.linalg.norm(axis)).tolist()
     return torch.linalg.matrix_exp(torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64))
@@ -204,7 +198,7 @@ def _capsule(length: float, radii: tuple[float, float], flat: float, n_around: i
     return vertices.reshape(-1, 3), faces[has_area], uv[has_area]
 
 
-# --- the runner ---
+# --- the figure ---
 
 FIGURE_SCALE = 1.2
 # name, where it hangs, how far to the side, degrees forward of straight down when the shutter opens and closes, length,
@@ -227,18 +221,32 @@ LIMBS = (
 )
 
 
-def _runner(end: int) -> dict[str, tuple[Tensor, Tensor]]:
-    """Return each limb's base and rotation at the start (0) or the end (1) of the exposure, limbs hanging on limbs."""
-    facing = _turn((0, 1, 0), -35)
-    joints = {"hip": torch.tensor([-0.1 + 0.25 * end, -0.15 + 0.06 * end, 0.0], dtype=torch.float64)}
+Pose = dict[str, tuple[Tensor, Tensor]]  # each limb's base (3,) and rotation (3, 3)
+
+
+def pose(share: float, hip: tuple[float, float]) -> Pose:
+    """Return where the limbs are in a share of the stride, limbs hanging on limbs, from the hip's place on."""
+    facing = rotation((0, 1, 0), -35)
+    joints = {"hip": torch.tensor([*hip, 0.0], dtype=torch.float64)}
     poses = {}
-    for name, parent, sideways, degrees, length, *_ in LIMBS:
+    for name, parent, sideways, (first, last), length, *_ in LIMBS:
         base = joints[parent] * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64)
         base = base + torch.tensor([0.0, 0.0, sideways], dtype=torch.float64)
-        turn = _turn((0, 0, 1), degrees[end] - 180)
+        turn = rotation((0, 0, 1), (1 - share) * first + share * last - 180)
         joints[name] = base + turn @ torch.tensor([0.0, length, 0.0], dtype=torch.float64)
         poses[name] = FIGURE_SCALE * facing @ base, FIGURE_SCALE * facing @ turn
     return poses
+
+
+def figure(size: int, poses: Sequence[Pose]) -> list[tb.Mesh]:
+    """Return the figure's limbs, moving linearly between poses at equally spaced times."""
+    meshes = []
+    for k, (name, *_, length, radii, flat, (colour, other, across, along)) in enumerate(LIMBS):
+        vertices, faces, uv = _capsule(length, radii, flat)
+        motion = torch.stack([vertices @ turn.T + base for base, turn in (p[name] for p in poses)])
+        look = textured(_cloth(max(8, size // 6), (colour, other), (across, along), seed=k))
+        meshes.append(tb.Mesh(motion, faces, look, name=name, uv=uv))
+    return meshes
 
 
 # --- textures: (h, w, 3) linear, row 0 on top ---
@@ -287,13 +295,13 @@ def _cloth(n: int, colours: Sequence[Sequence[float]], checks: tuple[int, int], 
     return _mix(*colours, np.abs(around - along)) * weave
 
 
-def _rings(n: int, count: int) -> np.ndarray:
+def rings(n: int, count: int) -> np.ndarray:
     """Return `count` bright rings on dark ground."""
     u, v = _texels(n, n)
     return _mix((0.15,) * 3, (1.0,) * 3, (np.hypot(u - 0.5, v - 0.5) * 2 * count) % 1 < 0.5)
 
 
-def _stripes(n: int, count: int) -> np.ndarray:
+def stripes(n: int, count: int) -> np.ndarray:
     """Return `count` bright diagonal stripes on dark ground."""
     u, v = _texels(n, n)
     return _mix((0.15,) * 3, (1.0,) * 3, ((u + v) * count) % 1 < 0.5)

@@ -24,6 +24,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
 
 from datagen import verify_dataset  # noqa: E402  after the path
+from datagen.run_log import LOG_NAME  # noqa: E402
 
 FIELDS = {
     "count": 12,
@@ -112,7 +113,8 @@ def children_of(pid: int) -> list[int]:
 
 def finds_a_flip(folder: Path, rng: random.Random) -> bool:
     """Change one bit of what `verify` answers for, and tell whether it is found."""
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith((".lock", "contact_sheet"))]
+    left_out = (".lock", LOG_NAME, "contact_sheet")
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith(left_out)]
     path = rng.choice(files)
     data = path.read_bytes()
     changed = bytearray(data)
@@ -124,8 +126,8 @@ def finds_a_flip(folder: Path, rng: random.Random) -> bool:
 
 
 def sums(folder: Path) -> dict[str, str]:
-    """Return the checksum of every file but the locks."""
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith(".lock")]
+    """Return the checksum of every file but the locks and the log of how long runs took."""
+    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith((".lock", LOG_NAME))]
     return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 

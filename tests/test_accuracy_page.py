@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import torchblur as tb
+from torchblur.backends import choose_backend
 
 
 @pytest.fixture
@@ -39,6 +40,22 @@ def test_every_method_is_measured_on_every_scene(page):
         assert all(row["time_s"] >= 0 for row in rows.values())
         assert 0 < record["check"]["rmse"] < 0.02
     assert rows["mcguire2012 15"]["psnr_db"] < rows["mean of 32"]["psnr_db"]  # pills, behind glass
+
+
+def test_the_verdict_is_that_of_the_times():
+    rows = {"exact": {"time_s": 1.0}, "mean of 32": {"time_s": 4.0}}
+    assert accuracy_page.verdict({"methods": rows, "looks_per_pixel": 3.0}) == (0.25, "faster than 32 sharp images")
+    rows["mean of 32"]["time_s"] = 0.5
+    ratio, text = accuracy_page.verdict({"methods": rows, "looks_per_pixel": 40.0})
+    assert ratio == 2.0
+    assert text.startswith("slower: 40.0 looks")
+
+
+def test_scenes_are_measured_where_they_have_a_compiled_path():
+    for name, make in accuracy_vs_time.SCENES.items():
+        scene = accuracy_vs_time.single(make(16))
+        assert choose_backend(scene, "auto") == "cpu", name
+        assert len(scene.meshes) == len(make(16).meshes)
 
 
 def test_errors_are_those_of_the_metrics():
@@ -78,7 +95,8 @@ def test_the_page_holds_all_that_it_shows(page):
     assert text.count("<img ") == 1 + 2 * 2
     assert len(re.findall(r"src='data:image/(?:svg\+xml|png);base64,", text)) == 5
     assert "http" not in re.sub(r"base64,[\w+/=]+", "", text)
-    assert text.count("<table>") == 2
+    assert text.count("<table>") == 2 + 1
+    assert text.count("32 sharp images</td>") + text.count("<td>slower: ") == 2
 
 
 def test_the_page_opens_in_a_browser_without_complaint(page):

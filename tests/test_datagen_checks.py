@@ -7,6 +7,7 @@ import pytest
 import datagen.runs
 from datagen import BlurDataset, FrameFileError, SpecError, generate, parse_spec, read_status, verify_dataset
 from datagen.manifest import MANIFEST_NAME
+from datagen.run_log import LOG_NAME
 
 TINY = {"width": 8, "height": 6, "rays_per_pixel": 1, "frames_per_clip": 2, "seed": 4, "count": 5}
 FLIPS = 100
@@ -21,7 +22,7 @@ def folder(request, tmp_path_factory):
 
 def covered_files(folder):
     """What verify answers for: all that is needed to use the data."""
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".lock")]
+    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith((".lock", LOG_NAME))]
     return sorted(p for p in files if p.name != "contact_sheet.png")
 
 

@@ -32,6 +32,7 @@ from datagen.spec import DatasetSpec, SpecError, parse_spec, read_spec_fields
         ("baselines", "mcguire2012,mcguire2012"),
         ("baselines", "mcguire2012, guertin2015"),
         ("baselines", ["mcguire2012"]),
+        ("lighting", "sun"),
         ("workers", 2),  # how it is made is no part of what is made
         ("assets", "somewhere"),  # the built-in shapes have none
     ],
@@ -87,13 +88,21 @@ def test_a_specification_cannot_be_changed():
 def test_the_hash_leaves_out_count_storage_and_the_place_of_assets_only(tmp_path):
     base = parse_spec({})
     changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
-               "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015"}  # fmt: skip
+               "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015", "lighting": "mixed"}  # fmt: skip
     cameras = [{"sensor": "gamma"}, {"sensor": "gamma", "sensor_gain": 2.0}]
     assert len({parse_spec(c).config_sha256() for c in (*cameras, {})}) == 3
     hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}
     assert len(hashes) == len(changed) + 1
     fields = {name for name in DatasetSpec.model_fields if not name.startswith("sensor")}
-    assert set(changed) == fields - {"source", "count", "assets", "storage", "frames_per_shard"}
+    assert set(changed) == fields - {
+        "source",
+        "count",
+        "assets",
+        "textures",
+        "backgrounds",
+        "storage",
+        "frames_per_shard",
+    }
     for field in ({"count": 99}, {"storage": "shards"}, {"frames_per_shard": 7}):
         assert parse_spec(field).config_sha256() == base.config_sha256()
     assert base.config_sha256("a") != base.config_sha256("b")

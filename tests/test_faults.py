@@ -16,7 +16,7 @@ import test_instant
 import test_seams
 import torch
 
-from torchblur import cells, edges, instant, intervals, packed, prisms, sampling, surfaces
+from torchblur import cells, edges, exposure, instant, intervals, packed, prisms, surfaces
 from torchblur.shutter import Shutter
 
 FLOAT64 = torch.float64
@@ -135,7 +135,7 @@ def plant_background_not_weighted(patch):
     def wrong(result):
         return dataclasses.replace(result, rgba=torch.cat([result.rgba[:, :3], torch.ones_like(result.rgba[:, 3:])], 1))
 
-    patch.setattr(render, "expose_samples", changed(render.expose_samples, wrong))
+    patch.setattr(exposure, "expose_samples", changed(exposure.expose_samples, wrong))
 
 
 def plant_segment_times_wrong(patch):
@@ -175,7 +175,7 @@ def plant_coverage_counted_twice(patch):
     def wrong(result):
         return dataclasses.replace(result, coverage=2 * result.coverage)
 
-    patch.setattr(render, "expose_samples", changed(render.expose_samples, wrong))
+    patch.setattr(exposure, "expose_samples", changed(exposure.expose_samples, wrong))
 
 
 def plant_ties_by_input_order(patch):
@@ -199,9 +199,9 @@ def plant_motion_upside_down(patch):
 
 
 def plant_accumulation_at_frame_starts(patch):
-    original = sampling.sum_of_instants
+    original = instant.sum_of_instants
     patch.setattr(
-        sampling,
+        instant,
         "sum_of_instants",
         lambda scene, faces, t, *rest: original(scene, faces, (t - t[0]).clamp(0, 1), *rest),
     )

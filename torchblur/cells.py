@@ -35,6 +35,17 @@ class Cells:
     layer_interval: Tensor  # (L,) int64
     n_crossings: int
 
+    def of_pixels(self, intervals: Intervals, pixels: Tensor) -> tuple[Intervals, Cells]:
+        """Return the `intervals`, which these cells cut, and the cells of `pixels` (C,), which become 0 to C - 1."""
+        chosen, offsets = packed.select(self.offsets, pixels)
+        layers, layer_offsets = packed.select(self.layer_offsets, chosen)
+        own, _ = packed.select(intervals.offsets, pixels)
+        place = torch.zeros_like(intervals.prism)
+        place[own] = torch.arange(len(own), device=own.device)
+        ends = self.t_start[chosen], self.t_end[chosen]
+        cells = Cells(offsets, *ends, layer_offsets, place[self.layer_interval[layers]], self.n_crossings)
+        return intervals.of_pixels(pixels), cells
+
 
 @dataclass(frozen=True)
 class Crossings:

@@ -132,30 +132,54 @@ def _rasterise(
     """Return the fragments of triangles (T, 3, 4) in their boxes (4, T), from instant `instants[1]` on."""
     clip, box = triangles
     t, first_instant, ray = instants
-    camera = scene.camera
-    n_faces, n_pixels = len(surfaces.opacity), camera.width * camera.height
     n_columns = box[2] - box[0] + 1
     count = n_columns * (box[3] - box[1] + 1)
-    local, triangle = packed.expand(torch.zeros_like(count), count)
-    column = box[0][triangle] + local % n_columns[triangle]
-    row = box[1][triangle] + local // n_columns[triangle]
+    local, which = packed.expand(torch.zeros_like(count), count)
+    column = box[0][which] + local % n_columns[which]
+    row = box[1][which] + local // n_columns[which]
+    number = torch.arange(len(clip), device=clip.device) + first_instant * len(surfaces.opacity)
+    return fragments_of(scene, surfaces, (clip, number), (which, row, column), (t, ray))
+
+
+def fragments_of(
+    scene: Scene,
+    surfaces: Surfaces,
+    triangles: tuple[Tensor, Tensor],
+    pairs: tuple[Tensor, Tensor, Tensor],
+    instants: tuple[Tensor, Ray],
+) -> Fragments:
+    """Return the fragments among pairs of a triangle and a ray.
+
+    Args:
+        scene: what to look at.
+        surfaces: of its faces.
+        triangles: clip space (T, 3, 4), and instant * F + face of each (T,).
+        pairs: which of these (n,), and row and column of the pixel.
+        instants: shutter times (B,), and the place of the ray inside each pixel.
+
+    Source: Olano & Greer 1997.
+    """
+    clip, number = triangles
+    which, row, column = pairs
+    t, ray = instants
+    camera = scene.camera
+    n_faces, n_pixels = len(surfaces.opacity), camera.width * camera.height
     x_ndc = 2 * (column.to(torch.float64) + ray.x_px) / camera.width - 1
     y_ndc = 1 - 2 * (row.to(torch.float64) + ray.y_px) / camera.height
-    sign = _inside(clip.detach(), triangle, (x_ndc, y_ndc))
-    front_only = surfaces.is_one_sided[triangle % n_faces]
+    sign = _inside(clip.detach(), which, (x_ndc, y_ndc))
+    front_only = surfaces.is_one_sided[number[which] % n_faces]
     kept = ((sign != 0) & ~(front_only & (sign < 0))).nonzero().flatten()
-    triangle, row, column, x_ndc, y_ndc, sign = (a[kept] for a in (triangle, row, column, x_ndc, y_ndc, sign))
-    corner = clip[triangle]  # (n, 3, 4)
+    which, row, column, x_ndc, y_ndc, sign = (a[kept] for a in (which, row, column, x_ndc, y_ndc, sign))
+    corner = clip[which]  # (n, 3, 4)
     z, w = corner[..., 2].T, corner[..., 3].T
     x, y = corner[..., 0].T - x_ndc * w, corner[..., 1].T - y_ndc * w
     e = _edge_values(x, y)
     bary = e / e.sum(0)
     z_hit, w_hit = (bary * z).sum(0), (bary * w).sum(0)
     kept = ((z_hit + w_hit >= 0) & (w_hit - z_hit >= 0) & torch.isfinite(bary).all(0)).nonzero().flatten()
-    z_hit, w_hit, triangle = z_hit[kept], w_hit[kept], triangle[kept]
-    instant = first_instant + triangle // n_faces
+    z_hit, w_hit, which = z_hit[kept], w_hit[kept], which[kept]
+    instant, face = number[which] // n_faces, number[which] % n_faces
     owner = instant * n_pixels + row[kept] * camera.width + column[kept]
-    face = triangle % n_faces
     nearness = 1 / w_hit if camera.orders_by_w else 2 - z_hit / w_hit
     order = argsort_by(owner, -nearness.detach())
     tied = is_tied(owner[order], nearness.detach()[order])

@@ -7,12 +7,15 @@ Source: ours; the displacement of a visible point is that of its barycentrics.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from torchblur import check, packed
+from torchblur.backends import choose_backend
 from torchblur.camera import CENTRE, MAX_RAYS, Ray, clip_to_px, pixel_rays
 from torchblur.fragments import Fragments, find_fragments
 from torchblur.scene import Scene
@@ -38,13 +41,14 @@ class Instant:
     bary: Tensor  # (H, W, 2) barycentrics of the face's corners 1 and 2 at the visible point; 0 if none
 
 
-def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> Instant:
+def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1, backend: str = "auto") -> Instant:
     """Return the scene at shutter time `t`.
 
     Args:
         scene: what to render.
         t: shutter time in [0, 1].
         rays_per_pixel: of the colour; depth, motion and ids always are those of the pixel's centre.
+        backend: "torch", "cpu" (compiled), or "auto"; see `backends.choose_backend`. The results are the same.
 
     Returns:
         An `Instant` on the scene's device, in its floating type.
@@ -59,16 +63,18 @@ def render_instant(scene: Scene, t: float = 0.5, *, rays_per_pixel: int = 1) -> 
         raise check.fail_type("scene", "a Scene", scene)
     check.number("t", t, 0.0, 1.0)
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
+    backend = choose_backend(scene, backend)
     camera, device = scene.camera, scene.device
     at = torch.tensor([t], dtype=torch.float64, device=device)
     surfaces = build_surfaces(scene)
     once = torch.full((1, 1), 1 / rays_per_pixel, dtype=torch.float64, device=device)
-    meshes_only = sum(sum_of_instants(scene, surfaces, at, once, ray) for ray in pixel_rays(rays_per_pixel))
+    sum_them, find = instants_by(backend, surfaces)
+    meshes_only = sum(sum_them(scene, surfaces, at, once, ray) for ray in pixel_rays(rays_per_pixel))
     n_pixels = camera.height * camera.width
     face = torch.full((n_pixels,), -1, dtype=torch.int64, device=device)
     bary = torch.zeros(3, n_pixels, dtype=torch.float64, device=device)
     depth = torch.full((n_pixels,), torch.inf, dtype=torch.float64, device=device)
-    for fragments in find_fragments(scene, surfaces, at, CENTRE):
+    for fragments in find(scene, surfaces, at, CENTRE):
         alpha = look(surfaces, fragments.face, *_points(scene, surfaces, fragments)).alpha
         seen = (alpha.detach() > 0).nonzero().flatten()
         owner, count = torch.unique_consecutive(packed.owners(fragments.offsets)[seen], return_counts=True)
@@ -153,7 +159,29 @@ def _displacement_px(scene: Scene, visible: tuple[Tensor, Tensor, Tensor], t: fl
     return out
 
 
-def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor, ray: Ray) -> Tensor:
+def instants_by(backend: str, surfaces: Surfaces) -> tuple[Callable[..., Tensor], Callable[..., Iterator[Fragments]]]:
+    """Return what does the work of `sum_of_instants` and `find_fragments` in "torch" or "cpu".
+
+    Where looks are not compiled, what is visible is found by compiled code and looked at by torch. Source: ours.
+    """
+    if backend == "torch":
+        return sum_of_instants, find_fragments
+    from torchblur.cpu import instant as compiled  # slow to import
+
+    if compiled.compiles_looks(surfaces):
+        return compiled.sum_of_instants, compiled.find_fragments
+    return functools.partial(sum_of_instants, find=compiled.find_fragments), compiled.find_fragments
+
+
+def sum_of_instants(
+    scene: Scene,
+    surfaces: Surfaces,
+    t: Tensor,
+    weight: Tensor,
+    ray: Ray,
+    *,
+    find: Callable[..., Iterator[Fragments]] | None = None,
+) -> Tensor:
     """Return (H, W, 4) float64, the weighted sum of the meshes' premultiplied colour and opacity at the instants.
 
     Args:
@@ -162,13 +190,14 @@ def sum_of_instants(scene: Scene, surfaces: Surfaces, t: Tensor, weight: Tensor,
         t: (B,) shutter times.
         weight: (B, H * W) or (B, 1).
         ray: place of the ray inside each pixel.
+        find: finds the fragments; `find_fragments` if None.
 
     Source: ours.
     """
     camera = scene.camera
     n_pixels = camera.height * camera.width
     total = torch.zeros(n_pixels, 4, dtype=torch.float64, device=t.device)
-    for fragments in find_fragments(scene, surfaces, t, ray):
+    for fragments in (find or find_fragments)(scene, surfaces, t, ray):
         which, points = _points(scene, surfaces, fragments)
         seen = look(surfaces, fragments.face, which, with_shadows(surfaces, points))
         before, after = packed.transmittance(seen.alpha, fragments.offsets)

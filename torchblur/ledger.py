@@ -30,6 +30,14 @@ class Ledger:
         """Count `n` more."""
         self.counts[name] += int(n)
 
+    def add_many(self, counts: dict[str, int]) -> None:
+        """Count all that `counts` says; of the deepest pixel, keep the largest."""
+        for name, n in counts.items():
+            if name == "deepest_pixel":
+                self.deepest(name, n)
+            else:
+                self.add(name, n)
+
     def deepest(self, name: str, n: int) -> None:
         """Keep the largest."""
         self.counts[name] = max(self.counts[name], int(n))

@@ -1,39 +1,31 @@
-"""Render the exact mean of a scene over its exposure, block of pixels by block of pixels.
+"""Render the exact mean of a scene over its exposure.
 
-Before: prisms.py, intervals.py, cells.py, nodes.py, resolve.py.  After: the user.
-Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
+Before: prisms.py, effects.py, exposure.py.  After: the user.
+Source: Ronnow et al. 2021 (pipeline).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from torchblur import check, packed
+from torchblur import check
 from torchblur.accuracy import Accuracy
-from torchblur.camera import MAX_RAYS, Ray, pixel_rays
-from torchblur.cells import count_layers, cut_cells
+from torchblur.backends import choose_backend
+from torchblur.camera import MAX_RAYS, pixel_rays
 from torchblur.effects import EffectPlan, agree_plan, check_effects, follow_plan, plan_prisms
-from torchblur.hidden import find_visible_intervals
-from torchblur.intervals import Intervals
+from torchblur.exposure import N_LOOKS, Exposure, Work
 from torchblur.ledger import Ledger
-from torchblur.nodes import add_shadows, estimate_bytes, estimate_path_bytes, find_varying, place_samples
-from torchblur.pairs import Block, count_pairs
-from torchblur.paths import cut_at_knots
-from torchblur.prisms import Prisms, build_prisms
-from torchblur.resolve import composite_samples, expose_samples, weigh_samples
+from torchblur.prisms import build_prisms
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
-from torchblur.subdivide import approximate
-from torchblur.surfaces import Surfaces, build_surfaces
-from torchblur.survey import Survey, survey_prisms
+from torchblur.surfaces import build_surfaces
+from torchblur.survey import survey_prisms
 
-BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
 MIN_MEMORY_BYTES = 1 << 20
-N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
 
 
 @dataclass(frozen=True)
@@ -51,7 +43,7 @@ class Frame:
     plan: EffectPlan  # which effects were simulated, and why
 
 
-def render(
+def render(  # noqa: PLR0913  all keywords but the first
     scene: Scene,
     *,
     accuracy: Accuracy | None = None,
@@ -59,6 +51,7 @@ def render(
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
+    backend: str = "torch",
 ) -> Frame:
     """Return the mean of `scene` over its exposure, weighted by the shutter, exact in time, without samples or noise.
 
@@ -74,6 +67,8 @@ def render(
             (0.4 kB a face and piece of motion, twice that where there is light) and the textures (43 bytes a texel
             with mip levels) come on top, with gradients autograd keeps every block, and a single ray
             that needs more gets it.
+        backend: "torch": any device, gradients; "cpu": compiled, for scenes on the CPU without gradients; "auto": the
+            compiled one where it can be and results are float32. They agree within 2e-5.
 
     Returns:
         A frame with `rgba` (H, W, 4), `coverage` (H, W, M), `shadow` (H, W) or None, counts, timings and the plan.
@@ -93,7 +88,7 @@ def render(
         0.25
     """
     shutters = (Shutter.box() if shutter is None else shutter,)
-    job = _checked_job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes)
+    job = _checked_job(scene, shutters, (accuracy, effects), (rays_per_pixel, memory_bytes), backend)
     return job.frames()[0]
 
 
@@ -106,6 +101,7 @@ def render_windows(  # noqa: PLR0913  as render, and the windows
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
+    backend: str = "torch",
 ) -> tuple[Frame, ...]:
     """Return a frame for each part of the exposure, all from one set of intervals, which is found only once.
 
@@ -113,7 +109,7 @@ def render_windows(  # noqa: PLR0913  as render, and the windows
         scene: what to render.
         windows: parts (start, end) of the exposure [shutter time]; they may overlap.
         shutter: whose weight applies inside each window, with unit integral; `Shutter.box()` if None.
-        accuracy, effects, rays_per_pixel, memory_bytes: as in `render`.
+        accuracy, effects, rays_per_pixel, memory_bytes, backend: as in `render`.
 
     Returns:
         One frame a window, each what `render` returns for `shutter.window(start, end)`; they share counts and timings.
@@ -131,19 +127,19 @@ def render_windows(  # noqa: PLR0913  as render, and the windows
     if not windows:
         raise check.fail("windows", "at least one pair (start, end)", windows)
     shutters = tuple(whole.window(start, end) for start, end in windows)
-    job = _checked_job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes)
+    job = _checked_job(scene, shutters, (accuracy, effects), (rays_per_pixel, memory_bytes), backend)
     return tuple(job.frames())
 
 
 def _checked_job(
     scene: Scene,
     shutters: tuple[Shutter, ...],
-    accuracy: Accuracy | None,
-    effects: str | EffectPlan,
-    rays_per_pixel: int,
-    memory_bytes: int,
+    how: tuple[Accuracy | None, str | EffectPlan],
+    costs: tuple[int, int],
+    backend: str,
 ) -> _Job:
     """Return the job of these arguments, or raise naming the wrong one."""
+    (accuracy, effects), (rays_per_pixel, memory_bytes) = how, costs
     if not isinstance(scene, Scene):
         raise check.fail_type("scene", "a Scene", scene)
     accuracy = Accuracy.exact() if accuracy is None else accuracy
@@ -160,17 +156,8 @@ def _checked_job(
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
     if check.positive_int("memory_bytes", memory_bytes) < MIN_MEMORY_BYTES:
         raise check.fail("memory_bytes", f"at least {MIN_MEMORY_BYTES}", memory_bytes)
-    return _Job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes, Ledger())
-
-
-@dataclass(frozen=True)
-class _Work:
-    """What there is to render, and what of it to simulate."""
-
-    plan: EffectPlan
-    prisms: Prisms
-    survey: Survey
-    chosen: Tensor  # (C,) int64 the prisms to look at
+    backend = choose_backend(scene, backend)
+    return _Job(scene, shutters, accuracy, effects, rays_per_pixel, memory_bytes, backend, Ledger())
 
 
 @dataclass(frozen=True)
@@ -183,6 +170,7 @@ class _Job:
     effects: str | EffectPlan
     rays_per_pixel: int
     memory_bytes: int
+    backend: str
     ledger: Ledger
 
     def frames(self) -> list[Frame]:
@@ -200,8 +188,9 @@ class _Job:
                 own = plan_prisms(scene, (prisms, survey), self.accuracy, self.rays_per_pixel)
                 plan = agree_plan(self.effects, own)
                 prisms, survey, chosen = follow_plan(plan, prisms, survey, self.accuracy)
-            work = _Work(plan, prisms, survey, chosen)
-            total = sum(self._image(work, ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
+            work = Work(plan, prisms, survey, chosen)
+            exposure = Exposure(scene, self.shutters, self.accuracy, self.memory_bytes, ledger, work, self.backend)
+            total = sum(exposure.image(ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
             casts = any(light.casts_shadows for light in scene.lights)
             return [self._frame(image, plan, casts) for image in total]
 
@@ -216,124 +205,3 @@ class _Job:
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
         shadow = shadow if has_shadows else None
         return Frame(rgba, coverage.to(scene.dtype), shadow, self.ledger.counts, self.ledger.timings, plan)
-
-    def _image(self, work: _Work, ray: Ray) -> Tensor:
-        """Return (shutters, H, W, N_LOOKS + M) float64: looks and coverage for one ray per pixel."""
-        camera, device = self.scene.camera, self.scene.device
-        whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
-        prisms, accuracy = work.prisms, self.accuracy
-        if accuracy.method == "adaptive" and "curvature" not in work.plan.simulated:
-            accuracy = Accuracy.linear()
-        places, values = [], []
-        for block, candidates in self._blocks(prisms, whole, work.chosen):
-            with self.ledger.stage("intervals", device):
-                intervals, counts = find_visible_intervals(prisms, work.survey, block, candidates)
-                intervals = approximate(prisms, intervals, accuracy)
-            self.ledger.add("blocks", 1)
-            for name, n in counts.items():
-                self.ledger.add(name, n)
-            self.ledger.add("intervals", intervals.count)
-            if intervals.count == 0:
-                continue
-            self.ledger.deepest("deepest_pixel", intervals.offsets.diff().max())
-            for pixels in self._chunks(prisms.surfaces, intervals):
-                column, row = block.x0 + pixels % block.width, block.y0 + pixels // block.width
-                places.append(row * camera.width + column)
-                values.append(self._resolve(work, intervals.of_pixels(pixels), (column, row)))
-        n_pixels, n_channels = camera.height * camera.width, N_LOOKS + len(self.scene.meshes)
-        image = torch.zeros(n_pixels, len(self.shutters), n_channels, dtype=torch.float64, device=device)
-        if places:
-            image = image.index_put((torch.cat(places),), torch.cat(values))
-        return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
-
-    def _resolve(self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], whole: bool = True) -> Tensor:
-        """Return (pixels, shutters, N_LOOKS + M) of the pixels at column and row `pixel`, in portions that fit."""
-        camera, device = self.scene.camera, self.scene.device
-        prisms, (column, row) = work.prisms, pixel
-        is_exact = self.accuracy.method == "exact"
-        lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
-        with self.ledger.stage("cells", device):
-            cells = cut_cells(prisms, intervals, "crossings" in work.plan.simulated)
-            cells = cells if is_exact else cut_at_knots(cells, self._knots(lines))
-        with self.ledger.stage("nodes", device):
-            varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
-            n_bytes = estimate_bytes(prisms, cells, varying)
-        if whole and len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
-            return self._in_portions(work, intervals, pixel, portions)
-        if varying is not None and prisms.surfaces.casters is not None:
-            with self.ledger.stage("shadows", device):
-                varying = add_shadows(prisms, varying)
-                n_bytes = estimate_bytes(prisms, cells, varying)
-            if len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
-                return self._in_portions(work, intervals, pixel, portions)
-            self.ledger.add_shadows(varying.shadows)
-        self.ledger.add("cells", len(cells.t_start))
-        self.ledger.add("layers", len(cells.layer_interval))
-        self.ledger.add("crossings", cells.n_crossings)
-        with self.ledger.stage("nodes", device):
-            samples = place_samples(prisms, cells, varying)
-        self.ledger.add("nodes", len(samples.cell))
-        with self.ledger.stage("resolve", device):
-            pixel_of = packed.owners(cells.offsets)[samples.cell]
-            offsets = packed.offsets_from_owners(pixel_of, len(column))
-            composite = composite_samples(prisms, intervals, cells, samples, self.accuracy, varying)
-            parts = []
-            for shutter, line in zip(self.shutters, lines, strict=True):
-                weight = weigh_samples(shutter, cells, samples, line[pixel_of])
-                done = expose_samples(offsets, composite, weight, len(self.scene.meshes))
-                parts.append(torch.cat([done.rgba, done.light, done.coverage], dim=1))
-            return torch.stack(parts, dim=1)
-
-    def _in_portions(
-        self, work: _Work, intervals: Intervals, pixel: tuple[Tensor, Tensor], portions: Sequence[Tensor]
-    ) -> Tensor:
-        """Return what `_resolve` does, portion by portion of the pixels."""
-        parts = []
-        for chosen in portions:
-            own = tuple(place[chosen] for place in pixel)
-            parts.append(self._resolve(work, intervals.of_pixels(chosen), own, False))
-        return torch.cat(parts)
-
-    def _knots(self, lines: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """Return the times (J,) at which the shutters bend, and by how much lines delay them (J, pixels)."""
-        times = [t for s in self.shutters for t in s.times]
-        delays = [s.line_delay * lines[k].to(torch.float64) for k, s in enumerate(self.shutters) for _ in s.times]
-        return torch.tensor(times, dtype=torch.float64, device=self.scene.device), torch.stack(delays)
-
-    def _blocks(self, prisms: Prisms, block: Block, candidates: Tensor) -> Iterator[tuple[Block, Tensor]]:
-        """Yield blocks whose pairs fit the memory, each with the prisms that may touch it; empty ones left out."""
-        counts = count_pairs(prisms, block, candidates)
-        candidates = candidates[counts > 0]
-        total = int(counts.sum())
-        if total == 0:
-            return
-        if total * BYTES_PER_PAIR <= self.memory_bytes or block.n_pixels == 1:
-            yield block, candidates
-            return
-        if block.width >= block.height:
-            half = block.width // 2
-            parts = replace(block, width=half), replace(block, x0=block.x0 + half, width=block.width - half)
-        else:
-            half = block.height // 2
-            parts = replace(block, height=half), replace(block, y0=block.y0 + half, height=block.height - half)
-        for part in parts:
-            yield from self._blocks(prisms, part, candidates)
-
-    def _chunks(self, surfaces: Surfaces, intervals: Intervals) -> Iterator[Tensor]:
-        """Yield runs of covered pixels whose layers fit the memory."""
-        with self.ledger.stage("cells", self.scene.device):
-            layers = count_layers(intervals)
-            pixels = (layers > 0).nonzero().flatten()
-            inner = {t for s in self.shutters for t in s.times} | {t for k in surfaces.lights for t in k.knots}
-            n_intervals = intervals.offsets.diff()[pixels]
-            n_bytes = estimate_path_bytes(surfaces, layers[pixels], n_intervals, len(inner - {0.0, 1.0}))
-        yield from (pixels[chosen] for chosen in _portions(n_bytes, self.memory_bytes))
-
-
-def _portions(n_bytes: Tensor, memory_bytes: int) -> Sequence[Tensor]:
-    """Return runs of indices whose `n_bytes` (n,) add up to about `memory_bytes` or are single."""
-    if len(n_bytes) == 0:
-        return ()
-    portion = torch.cumsum(n_bytes, 0) // memory_bytes
-    sizes = torch.unique_consecutive(portion, return_counts=True)[1].tolist()
-    return torch.arange(len(n_bytes), device=n_bytes.device).split(sizes)

@@ -6,6 +6,7 @@ Source: accumulation buffer, Haeberli & Akeley 1990; stochastic rasterisation, A
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torchblur import check
+from torchblur.backends import choose_backend
 from torchblur.camera import MAX_RAYS, pixel_rays
-from torchblur.instant import sum_of_instants
+from torchblur.instant import instants_by
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
 from torchblur.surfaces import build_surfaces
@@ -23,6 +25,7 @@ from torchblur.time_samples import HALTON_BITS, rotated_halton, stratified, sum_
 MAX_TIMES = 1 << HALTON_BITS
 MAX_OWNERS = 2_000_000  # pixels of instants handled together
 MAX_TRIANGLES = 200_000  # faces of instants handled together
+AT_ONCE_COMPILED = 4  # times as many of both where the search is compiled
 SEQUENCES = ("midpoint", "halton")
 PLACES = ("area", "centre")
 
@@ -35,7 +38,7 @@ class Accumulated:
     times: int  # how many, a pixel and ray
 
 
-def accumulate(
+def accumulate(  # noqa: PLR0913  what random draws, and how they are looked at
     scene: Scene,
     times: int = 4096,
     *,
@@ -43,6 +46,7 @@ def accumulate(
     rays_per_pixel: int = 1,
     sequence: str = "midpoint",
     seed: int = 0,
+    backend: str = "auto",
 ) -> Accumulated:
     """Return the mean of `times` looks at the scene while the shutter is open.
 
@@ -54,6 +58,7 @@ def accumulate(
         sequence: "midpoint": sharp images at the midpoints of equal parts of the exposure; "halton": the first N of
             the sequence in base 2, moved round the exposure by a random amount for each pixel and ray.
         seed: of these amounts.
+        backend: "torch", "cpu" (compiled), or "auto"; see `backends.choose_backend`. The results are the same.
 
     Returns:
         `rgba` (H, W, 4), on the scene's device and in its floating type.
@@ -73,13 +78,13 @@ def accumulate(
     check.positive_int("rays_per_pixel", rays_per_pixel, MAX_RAYS)
     if sequence not in SEQUENCES:
         raise check.fail("sequence", f"one of {', '.join(SEQUENCES)}", sequence)
-    generator = _generator(seed)
+    generator, backend = _generator(seed), choose_backend(scene, backend)
     surfaces = build_surfaces(scene)
     if sequence == "halton":
-        total = 0
+        total, sum_them = 0, _samples_by(backend)
         for ray in pixel_rays(rays_per_pixel):
             draw = rotated_halton(times, ray, generator)
-            total = total + sum_of_samples(scene, surfaces, shutter, times, draw)
+            total = total + sum_them(scene, surfaces, shutter, times, draw)
         return Accumulated(scene.over_background(total / rays_per_pixel).to(scene.dtype), times)
     camera = scene.camera
     n_lines = shutter.n_lines(camera.width, camera.height)
@@ -89,18 +94,25 @@ def accumulate(
     line = shutter.line_of(pixel % camera.width, pixel // camera.width, (camera.width, camera.height))
     line = line if shutter.line_delay else line[:1]  # one weight serves all
     n_faces = max(1, len(surfaces.opacity))
-    batch = max(1, min(MAX_OWNERS // len(pixel), MAX_TRIANGLES // n_faces))
-    total = 0
+    at_once = AT_ONCE_COMPILED if backend == "cpu" else 1  # it keeps nothing by pixel or by pair
+    batch = max(1, at_once * min(MAX_OWNERS // len(pixel), MAX_TRIANGLES // n_faces))
+    total, (sum_them, _) = 0, instants_by(backend, surfaces)
     for part in torch.arange(times, device=scene.device).split(batch):
         early, late = ends[part].unsqueeze(1), ends[part + 1].unsqueeze(1)
         weight = shutter.weight(early, late, line) / rays_per_pixel
         for ray in pixel_rays(rays_per_pixel):
-            total = total + sum_of_instants(scene, surfaces, 0.5 * (early + late).flatten(), weight, ray)
+            total = total + sum_them(scene, surfaces, 0.5 * (early + late).flatten(), weight, ray)
     return Accumulated(scene.over_background(total).to(scene.dtype), times)
 
 
 def stochastic(
-    scene: Scene, samples: int = 64, *, shutter: Shutter | None = None, places: str = "area", seed: int = 0
+    scene: Scene,
+    samples: int = 64,
+    *,
+    shutter: Shutter | None = None,
+    places: str = "area",
+    seed: int = 0,
+    backend: str = "auto",
 ) -> Accumulated:
     """Return the mean of `samples` random looks per pixel, each at a time and a place of its own.
 
@@ -112,6 +124,7 @@ def stochastic(
         shutter: weighs the samples; `Shutter.box()`, the whole exposure, if None.
         places: of the rays: "area", over the pixel; "centre", as `render` with one ray.
         seed: of all that is random.
+        backend: as in `accumulate`.
 
     Returns:
         `rgba` (H, W, 4), on the scene's device and in its floating type. Its mean over seeds is the image that
@@ -132,9 +145,19 @@ def stochastic(
     shutter = _shutter(shutter)
     if places not in PLACES:
         raise check.fail("places", f"one of {', '.join(PLACES)}", places)
+    sum_them = _samples_by(choose_backend(scene, backend))
     draw = stratified(samples, places == "area", _generator(seed))
-    total = sum_of_samples(scene, build_surfaces(scene), shutter, samples, draw)
+    total = sum_them(scene, build_surfaces(scene), shutter, samples, draw)
     return Accumulated(scene.over_background(total).to(scene.dtype), samples)
+
+
+def _samples_by(backend: str) -> Callable[..., Tensor]:
+    """Return what does the work of `sum_of_samples` in "torch" or "cpu"."""
+    if backend == "torch":
+        return sum_of_samples
+    from torchblur.cpu.samples import sum_of_samples as compiled  # slow to import
+
+    return compiled
 
 
 def _shutter(shutter: Any) -> Shutter:

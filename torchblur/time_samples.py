@@ -42,7 +42,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class _Rays:
+class SampleRays:
     """One ray for each of P pixels."""
 
     t: Tensor  # (P,) float64 shutter time
@@ -117,30 +117,49 @@ def sum_of_samples(
 
     Source: ours.
     """
+    parts = []
+    for ranks in blocks_of_rows(scene, shutter, count, draw):
+        parts.append(sum(weight.unsqueeze(1) * _see(scene, surfaces, rays) for rays, weight in ranks))
+    return torch.cat(parts).reshape(scene.camera.height, scene.camera.width, 4)
+
+
+def blocks_of_rows(
+    scene: Scene, shutter: Shutter, count: int, draw: Callable[[int], Samples]
+) -> Iterator[Iterator[tuple[SampleRays, Tensor]]]:
+    """Yield, for each block of rows, its samples rank by rank: one ray for each pixel, and its weight (P,).
+
+    Args:
+        scene, shutter, count, draw: as in `sum_of_samples`.
+
+    Source: ours.
+    """
     camera = scene.camera
     size = camera.width, camera.height
-    open_for = shutter.t_close - shutter.t_open
     shutter.span(shutter.n_lines(*size))  # raises if the last line closes after the exposure
     rows = max(1, MAX_SAMPLES // (count * camera.width))
-    parts = []
     for first_row in range(0, camera.height, rows):
         pixel = torch.arange(first_row * camera.width, min(first_row + rows, camera.height) * camera.width)
-        samples = draw(len(pixel))
         column, row = (c.to(scene.device) for c in (pixel % camera.width, pixel // camera.width))
-        line = shutter.line_of(column, row, size)
-        total = torch.zeros(len(pixel), 4, dtype=torch.float64, device=scene.device)
-        for n in range(count):
-            share, x, y = (s[min(n, len(s) - 1)].to(scene.device) for s in (samples.share, samples.x_px, samples.y_px))
-            t = shutter.t_open + share * open_for
-            weight = shutter.density(t.clamp(max=shutter.t_close), torch.zeros_like(line)) * (open_for / count)
-            t = (t + shutter.line_delay * line).clamp(max=1.0)
-            rays = _Rays(t, column + x, row + y, first_row, samples.spacing_px)
-            total = total + weight.unsqueeze(1) * _see(scene, surfaces, rays)
-        parts.append(total)
-    return torch.cat(parts).reshape(camera.height, camera.width, 4)
+        yield _ranks(shutter, count, draw(len(pixel)), (column, row, size))
 
 
-def _see(scene: Scene, surfaces: Surfaces, rays: _Rays) -> Tensor:
+def _ranks(
+    shutter: Shutter, count: int, samples: Samples, pixels: tuple[Tensor, Tensor, tuple[int, int]]
+) -> Iterator[tuple[SampleRays, Tensor]]:
+    """Yield the rays and weights of pixels, columns and rows (P,) of an image of a size, rank by rank."""
+    column, row, size = pixels
+    line = shutter.line_of(column, row, size)
+    open_for = shutter.t_close - shutter.t_open
+    for n in range(count):
+        parts = samples.share, samples.x_px, samples.y_px
+        share, x, y = (s[min(n, len(s) - 1)].to(column.device) for s in parts)
+        t = shutter.t_open + share * open_for
+        weight = shutter.density(t.clamp(max=shutter.t_close), torch.zeros_like(line)) * (open_for / count)
+        t = (t + shutter.line_delay * line).clamp(max=1.0)
+        yield SampleRays(t, column + x, row + y, int(row[0]), samples.spacing_px), weight
+
+
+def _see(scene: Scene, surfaces: Surfaces, rays: SampleRays) -> Tensor:
     """Return (P, 4) the meshes' premultiplied colour and opacity along the rays."""
     prisms = build_prisms(scene, surfaces, (float(rays.t.min()), float(rays.t.max())))
     hits = [_hit(prisms, rays, scene, *pairs) for pairs in _pairs(prisms, rays, scene.camera.width)]
@@ -182,7 +201,7 @@ def _between(ends: Tensor, prism: Tensor, u: Tensor) -> Tensor:
     return (1 - u) * ends[0][..., prism] + u * ends[1][..., prism]
 
 
-def _pairs(prisms: Prisms, rays: _Rays, width: int) -> Iterator[tuple[Tensor, Tensor]]:
+def _pairs(prisms: Prisms, rays: SampleRays, width: int) -> Iterator[tuple[Tensor, Tensor]]:
     """Yield prisms and pixels (m,) of the rays inside the prisms' bounds, up to MAX_PAIRS or one prism at a time."""
     n_rows = len(rays.t) // width
     low, high = prisms.bounds_px[:2], prisms.bounds_px[2:]
@@ -207,7 +226,7 @@ def _pairs(prisms: Prisms, rays: _Rays, width: int) -> Iterator[tuple[Tensor, Te
         first = last
 
 
-def _hit(prisms: Prisms, rays: _Rays, scene: Scene, prism: Tensor, pixel: Tensor) -> tuple[Tensor, ...]:
+def _hit(prisms: Prisms, rays: SampleRays, scene: Scene, prism: Tensor, pixel: Tensor) -> tuple[Tensor, ...]:
     """Return what of the pairs (m,) is a hit: prism, pixel, nearness, barycentrics (3, n), side, their slopes
     (2, 3, n), or (2, 0, n) without mips, and the time inside the prism.
     """

@@ -1,0 +1,93 @@
+"""Run log: how long the runs of a data set took, for its report; no byte of a frame depends on it.
+
+Before: nothing.  After: runs.py writes it, pages.py reads it.
+`.runs.log` has one line of JSON for each run that made or failed to make a frame; a run that was killed has none.
+Slices append to the same file, a line in one write.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+LOG_NAME = ".runs.log"
+
+
+@dataclass
+class RunNote:
+    """What one run made, and in what time."""
+
+    started_s: float  # since 1970, UTC
+    seconds: float
+    made: int  # frames
+    failed: int
+    workers: int
+    part: str  # the slice as `3/100`; empty for a whole run
+
+    @property
+    def pairs_per_s(self) -> float:
+        """Frames made in a second."""
+        return self.made / self.seconds if self.seconds > 0 else 0.0
+
+
+@contextmanager
+def logged_run(folder: Path, workers: int, part: str) -> Iterator[RunNote]:
+    """Give a note to count in, and add it to the log when the block ends, however; not if nothing was done.
+
+    A log that cannot be written is told of on stderr: the frames do not depend on it.
+
+    Args:
+        folder: of the data set.
+        workers: processes of the run.
+        part: see `RunNote`.
+
+    Source: ours.
+    """
+    note = RunNote(time.time(), 0.0, 0, 0, workers, part)
+    start = time.monotonic()
+    try:
+        yield note
+    finally:
+        note.seconds = time.monotonic() - start
+        if note.made or note.failed:
+            line = json.dumps(asdict(note), sort_keys=True).encode() + b"\n"
+            try:
+                descriptor = os.open(folder / LOG_NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+                try:
+                    os.write(descriptor, line)
+                finally:
+                    os.close(descriptor)
+            except OSError as error:
+                print(f"{folder / LOG_NAME}: expected to add a line, got {error.strerror}", file=sys.stderr)
+
+
+def read_log(folder: str | Path) -> tuple[list[RunNote], int]:
+    """Return the notes in the order of their lines, none if there is no log, and how many lines cannot be read.
+
+    Source: ours.
+    """
+    try:
+        lines = (Path(folder) / LOG_NAME).read_bytes().splitlines()
+    except FileNotFoundError:
+        return [], 0
+    notes, unread = [], 0
+    for line in lines:
+        try:
+            note = RunNote(**json.loads(line))
+            numbers = (note.started_s, note.seconds, note.made, note.failed, note.workers)
+            is_valid = all(isinstance(n, (int, float)) and math.isfinite(n) and n >= 0 for n in numbers)
+            is_valid = is_valid and isinstance(note.part, str)
+        except (ValueError, TypeError, RecursionError):
+            is_valid = False
+        if is_valid:
+            notes.append(note)
+        else:
+            unread += 1
+    return notes, unread

@@ -1,0 +1,1 @@
+"""Compiled twins of torchblur's stages for tensors on the CPU. No logic here."""

@@ -140,6 +140,31 @@ class PlayedVertices:
         return [t for t in times if open_s < t < close_s]
 
 
+@dataclass(frozen=True, eq=False)
+class CarriedVertices:
+    """A sequence that plays on while its whole body moves."""
+
+    sequence: PlayedVertices
+    motion: RigidMotion
+
+    @property
+    def is_static(self) -> bool:
+        """Whether nothing ever moves."""
+        return self.sequence.is_static and self.motion.is_static
+
+    def at(self, times_s: Tensor) -> Tensor:
+        """Return (N, V, 3) float64 world positions at times (N,) [s]. Source: ours."""
+        return self.motion.place(self.sequence.at(times_s), times_s)
+
+    def resting(self) -> Tensor:
+        """Return the (V, 3) vertices of the first frame, before the whole body moves."""
+        return self.sequence.resting()
+
+    def kinks_s(self, open_s: float, close_s: float) -> list[float]:
+        """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""
+        return self.sequence.kinks_s(open_s, close_s)
+
+
 @dataclass(frozen=True)
 class CameraPath:
     """A perspective camera that looks from a moving eye at a moving target (dolly, pan, shake) and may orbit and roll.

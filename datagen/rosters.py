@@ -12,7 +12,7 @@ from pathlib import Path
 from datagen.animated import ANIMATED_SUFFIXES, AnimatedAsset, is_animated, load_animated
 from datagen.assets import MESH_SUFFIXES, Roster, files_under, load_mesh, tensors_sha256
 from datagen.formats import MeshError
-from datagen.sequences import survey_sequence
+from datagen.sequences import CACHE_SUFFIX, survey_sequence
 from datagen.usd_files import USD_SUFFIXES, vet_usd
 
 # Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
@@ -34,8 +34,13 @@ def survey_meshes(folder: str | Path) -> Roster:
     for name in files_under(folder):
         suffix = Path(name).suffix.lower()
         if suffix in UNREAD_SUFFIXES:
-            refused.append((name, f"expected one of {', '.join((*MESH_SUFFIXES, *USD_SUFFIXES))}, got a {suffix} file"))
-        if suffix not in (*MESH_SUFFIXES, *ANIMATED_SUFFIXES):
+            refused.append(
+                (
+                    name,
+                    f"expected one of {', '.join((*MESH_SUFFIXES, *USD_SUFFIXES, CACHE_SUFFIX))}, got a {suffix} file",
+                )
+            )
+        if suffix not in (*MESH_SUFFIXES, *ANIMATED_SUFFIXES, CACHE_SUFFIX):
             continue
         path = Path(folder) / name
         try:
@@ -76,5 +81,7 @@ def _content(path: Path) -> bytes:
     """Return the hash of what a mesh file holds, animated or not."""
     if is_animated(path):
         return bytes.fromhex(_vetted(path).sha256)
+    if path.suffix.lower() == CACHE_SUFFIX:
+        return bytes.fromhex(survey_sequence(path).sha256)
     asset = load_mesh(str(path))
     return tensors_sha256(asset.vertices, asset.faces, asset.color, asset.opacity)

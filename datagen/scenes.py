@@ -22,12 +22,12 @@ from datagen.assets import Roster, load_mesh
 from datagen.casts import build_cast, choose_motion, choose_places
 from datagen.clips import Actor, Clip
 from datagen.lit_stages import choose_lit_stage, is_clip_lit
-from datagen.motions import Path, PlayedVertices, RigidBody, RigidMotion, turns
+from datagen.motions import CarriedVertices, Path, PlayedVertices, RigidBody, RigidMotion, turns
 from datagen.patterns import lit_color, paint, palette_colours
 from datagen.photos import survey_photos
 from datagen.rosters import survey_meshes, survey_played
 from datagen.seeds import open_stream
-from datagen.sequences import load_sequence
+from datagen.sequences import CACHE_SUFFIX, load_sequence
 from datagen.shapes import Shape
 from datagen.spec import DatasetSpec, parse_spec
 from datagen.stages import choose_stage
@@ -173,9 +173,14 @@ def _mesh_cast(
         path = str(FilePath(str(spec.assets)) / name)
         size = float(rng.uniform(1.25, 1.75)) * (1.0, 0.8, 0.66)[n - 1] * min(1.0, max(aspect, 0.5))
         place = tuple(0.35 * c for c in places[0]) if n == 1 else tuple(0.8 * c for c in places[k])
-        if is_animated(path):
+        is_cache = FilePath(path).suffix.lower() == CACHE_SUFFIX
+        if is_cache or is_animated(path):
             motion = choose_motion(rngs["motion"], place, size)
-            actor, told, unread = _animated_actor(path, f"{name}-{k}", (size, motion), (rngs, colours, is_lit))
+            looks, title = (rngs, colours, is_lit), f"{name}-{k}"
+            if is_cache:
+                actor, told, unread = _cache_actor((path, spec.sequence_fps), title, (size, motion), looks)
+            else:
+                actor, told, unread = _animated_actor(path, title, (size, motion), looks)
             actors.append(actor)
             played[actor.name] = told
             not_used += [f"{name}: {note}" for note in unread]
@@ -228,6 +233,29 @@ def _sequence_actor(
         notes["not_used"] = list(asset.notes)
     motion = PlayedVertices(positions, spec.sequence_fps, start_s)
     return Actor(asset.name, asset.faces, color, motion, is_lit=is_lit)
+
+
+def _cache_actor(
+    file: tuple[str, float],
+    name: str,
+    body: tuple[float, RigidMotion],
+    looks: tuple[dict[str, np.random.Generator], Tensor, bool],
+) -> tuple[Actor, dict[str, object], tuple[str, ...]]:
+    """Return a vertex cache at a rate [Hz] as an actor of a size and a motion, what is played of it, what is not."""
+    (path, rate_hz), (size, motion), (rngs, colours, is_lit) = file, body, looks
+    asset = load_sequence(path)
+    positions = asset.positions * size
+    start_s = float(rngs["cast"].uniform(0, 2 * (len(positions) - 1) / rate_hz))
+    shape = Shape(positions[0], asset.faces, _flat_uv(positions[0], asset.faces), False)
+    color = _asset_color(shape, asset.color, colours, rngs["colour"], is_lit)
+    player = CarriedVertices(PlayedVertices(positions, rate_hz, start_s), motion)
+    told: dict[str, object] = {
+        "name": "frames",
+        "length_s": (len(positions) - 1) / rate_hz,
+        "start_s": start_s,
+        "played": "back and forth",
+    }
+    return Actor(name, asset.faces, color, player, is_lit=is_lit), told, asset.notes
 
 
 def _animated_actor(

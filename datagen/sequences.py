@@ -1,6 +1,6 @@
 """Sequences: one mesh whose vertices move from frame to frame, from a `.npz`, a folder of files or one mesh file.
 
-Before: formats.py, assets.py.  After: scenes.py.
+Before: formats.py, assets.py.  After: rosters.py, scenes.py.
 Symbols: V vertices, F faces, P frames.
 """
 
@@ -25,6 +25,8 @@ from datagen.assets import (
     tensors_sha256,
 )
 from datagen.formats import MeshError, check_size, short_reason
+
+CACHE_SUFFIX = ".npz"
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +73,7 @@ def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAs
     place = Path(path)
     if place.is_dir():
         return _load_frames(place)
-    if place.suffix.lower() != ".npz":
+    if place.suffix.lower() != CACHE_SUFFIX:
         vertices, faces, color, _, notes = parse_mesh(place)
         note = "one mesh file: a single frame, so the mesh itself stands still"
         return SequenceAsset(place.name, normalise(path, vertices[None], faces), faces, color, (*notes, note))

@@ -206,6 +206,15 @@ def test_knots_follow_a_turn_and_not_its_chord(tmp_path):
     torch.testing.assert_close(vertices, player.at(times), atol=1e-6, rtol=0)
 
 
+def test_a_step_within_an_exposure_is_told_as_beyond_the_limit(tmp_path):
+    player = played(spinner("STEP", 90), tmp_path / "a.gltf", start_s=0.5)
+    camera = CameraPath(Path((0.0, 0.0, 5.0)), Path((0.0, 0.0, 0.0)), 40.0, 0.1, 100.0)
+    actor = Actor("a", load_animated(str(tmp_path / "a.gltf")).faces, torch.ones(3), player)
+    knots = expose(Clip((actor,), camera, torch.zeros(3)), 64, 64, 0.0, 1.0).mesh_knots[0]
+    assert knots.limit_reached
+    assert knots.segments == 64
+
+
 def data_spec(tmp_path, **fields):
     base = {"width": 32, "height": 24, "rays_per_pixel": 1, "frames_per_clip": 2, "count": 4, "assets": str(tmp_path)}
     return parse_spec(base | {"source": "meshes"} | fields)
@@ -216,14 +225,18 @@ def test_a_folder_with_animated_files_is_a_source_of_meshes(tmp_path):
     assets.mkdir()
     bender().save(assets / "bend.glb")
     spinner().save(assets / "spin.gltf", beside=True)
-    spec = data_spec(assets)
+    frames = np.stack([np.array(SQUARE, float) * k for k in (1.0, 1.5, 2.0)])
+    np.savez(assets / "grow.npz", vertices=frames, faces=np.array([[0, 1, 2], [0, 2, 3]]))
+    spec = data_spec(assets, seed=4)
     roster = survey_assets(spec)
-    assert roster.names == ("bend.glb", "spin.gltf")
+    assert roster.names == ("bend.glb", "grow.npz", "spin.gltf")
     plan = Plan(spec, roster.names, roster.sha256).to_json()
-    told = make_sample(plan, 0).meta["scene"]["animations"]
-    for take in told.values():
-        assert take["name"] == "take"
-        assert take["length_s"] == 1
+    told = make_sample(plan, 0).meta["scene"]["animations"] | make_sample(plan, 2).meta["scene"]["animations"]
+    assert {name.rsplit("-", 1)[0] for name in told} == set(roster.names)
+    for name, take in told.items():
+        assert take["name"] == ("frames" if "npz" in name else "take")
+        assert take["length_s"] == (2 / 24 if "npz" in name else 1)
+        assert 0 <= take["start_s"] <= 2 * take["length_s"]
         assert take["played"] == "back and forth"
     assert make_sample(plan, 0).meta["meshes"][-1]["segments"] >= 1
     one, two = (generate(spec, tmp_path / f"out{n}", workers=n) for n in (1, 2))

@@ -24,12 +24,9 @@ from datagen.executors import MAX_TRIES, Outcome, Task, attempt
 from datagen.spec import SpecError
 
 OBJECT_STORE_BYTES = 128 * 2**20  # nothing but short texts is stored
-# Must be set before the import: no report to anyone, no port beyond this machine, no warning about devices.
-SETTINGS = {
-    "RAY_USAGE_STATS_ENABLED": "0",
-    "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",
-    "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0",
-}
+# Must be set before the import: no report to anyone, no warning about devices.
+SETTINGS = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
+ALONE = {"RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0"}  # no port that other machines reach, where there is no cluster
 
 
 def run_ray(task: Task, plan_json: str, folder: str, indices: Iterable[int], workers: int) -> Iterator[Outcome]:
@@ -91,7 +88,7 @@ def _attempt_alone(task: Task, plan_json: str, folder: str, index: int) -> tuple
 @contextlib.contextmanager
 def _session(workers: int) -> Iterator[Any]:
     """Lend a connected Ray: the one that this program already has, the cluster's, or one of its own that ends here."""
-    for name, value in SETTINGS.items():
+    for name, value in (SETTINGS | ({} if os.environ.get("RAY_ADDRESS") else ALONE)).items():
         os.environ.setdefault(name, value)
     check_ray()
     with warnings.catch_warnings():

@@ -157,3 +157,32 @@ def test_gradients_need_torch():
         tb.render(scene, backend="cpu")
     with pytest.raises(ValueError, match=r"backend: expected one of auto, torch, cpu, got .*gpu"):
         tb.render_windows(scene, [(0, 1)], backend="gpu")
+
+
+class Frames(torch.utils.data.Dataset):
+    """Two frames, each rendered where it is asked for."""
+
+    def __len__(self) -> int:
+        return 2
+
+    def __getitem__(self, k: int) -> torch.Tensor:
+        plain = agreement_scenes.SCENES["transparent"]()
+        scene = make.to_torch(PlainScene(plain.meshes, plain.world_to_clip, 40, 40, plain.background))
+        return tb.render(scene, backend="cpu", shutter=tb.Shutter.box(0, 0.5 + 0.5 * k)).rgba
+
+
+@pytest.mark.parametrize("start", ["fork", "spawn"])
+def test_workers_of_a_data_loader(start):
+    """Before, with two threads, and after in the parent."""
+    frames, before = Frames(), torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        expected = [frames[k] for k in range(2)]
+        loader = torch.utils.data.DataLoader(
+            frames, batch_size=None, num_workers=1, multiprocessing_context=start, timeout=300
+        )
+        found = list(loader)
+        again = [frames[k] for k in range(2)]
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(found + again, expected + expected, strict=True))

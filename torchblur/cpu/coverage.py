@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
 from torchblur.edges import CLIP_NOISE
 
@@ -52,7 +52,7 @@ def make_work() -> Work:
     )
 
 
-@jit
+@inlined
 def _edges(c: np.ndarray, out: np.ndarray) -> None:
     """Write the Bernstein coefficients of the edges of corners `c` (2, 3, 4) to `out` (3, 3)."""
     for edge in range(3):
@@ -65,7 +65,7 @@ def _edges(c: np.ndarray, out: np.ndarray) -> None:
         out[2, edge] = turn * (px * qy - py * qx)
 
 
-@jit
+@inlined
 def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     """Write the local times at which an edge may change sign to `root[:, edge]`; 1 where there is none."""
     i, j = FIRST[edge], SECOND[edge]
@@ -92,7 +92,7 @@ def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     root[0, edge], root[1, edge] = min(first, second), max(first, second)
 
 
-@jit
+@inlined
 def _untied(e: float, slope_x: float, slope_y: float) -> float:
     """Return `e`, or where it is 0 the first of its slopes along the ray's x and y that is not."""
     return e if e != 0 else slope_x if slope_x != 0 else slope_y
@@ -100,14 +100,8 @@ def _untied(e: float, slope_x: float, slope_y: float) -> float:
 
 @jit
 def _edge_signs(work: Work, edge: int) -> None:
-    """Write the signs of an edge before, between and after its roots."""
-    e, corner = work.edge, work.corner
-    if e[0, edge] > 0 and e[1, edge] > 0 and e[2, edge] > 0:
-        work.sign[0, edge] = work.sign[1, edge] = work.sign[2, edge] = 1
-        return
-    if e[0, edge] < 0 and e[1, edge] < 0 and e[2, edge] < 0:
-        work.sign[0, edge] = work.sign[1, edge] = work.sign[2, edge] = -1
-        return
+    """Write the signs of an edge that may change it before, between and after its roots."""
+    corner = work.corner
     i, j = FIRST[edge], SECOND[edge]
     turn = -1.0 if edge == 1 else 1.0
     a0, a1, a2 = corner[0, i, 0], corner[0, i, 1], corner[0, i, 2]
@@ -150,7 +144,7 @@ def _still_sign(work: Work) -> int:
     return common
 
 
-@jit
+@inlined
 def _inside_sign(work: Work, u: float) -> int:
     """Return the common sign of the edges at a local time, 0 outside."""
     common = 0
@@ -243,6 +237,14 @@ def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> i
     cut, n_cuts = work.cut, 2
     cut[0], cut[1] = 0.0, 1.0
     for k in range(3):
+        if e[0, k] > 0 and e[1, k] > 0 and e[2, k] > 0:
+            work.root[0, k] = work.root[1, k] = 1.0
+            work.sign[0, k] = work.sign[1, k] = work.sign[2, k] = 1
+            continue
+        if e[0, k] < 0 and e[1, k] < 0 and e[2, k] < 0:
+            work.root[0, k] = work.root[1, k] = 1.0
+            work.sign[0, k] = work.sign[1, k] = work.sign[2, k] = -1
+            continue
         _edge_roots(corner, k, work.root)
         _edge_signs(work, k)
         for r in range(2):

@@ -7,6 +7,7 @@ Source: ours.
 from __future__ import annotations
 
 import hashlib
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,18 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
 
     Where nothing can be written it is compiled anew in each process. Source: ours.
     """
-    options = {"nogil": True, "error_model": "numpy"}
+    return _compiled(function)
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` for others to be compiled into: a call counts references to each array, which costs more than
+    short functions do. Source: ours.
+    """
+    return _compiled(function, inline="always")
+
+
+def _compiled(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
+    options = {"nogil": True, "error_model": "numpy", **more}
     try:
         compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # no folder to store it in
@@ -38,3 +50,10 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     stored = compiled._cache._cache_file
     stored._source_stamp = (stored._source_stamp, DIGEST)
     return compiled
+
+
+def announce(function: Callable[..., Any]) -> None:
+    """Log a warning if a function was never compiled here, as its first call will then take its time. Source: ours."""
+    stored = getattr(getattr(function, "_cache", None), "cache_path", None)
+    if not function.signatures and not (stored and any(Path(stored).glob(f"*.{function.__name__}-*.nbi"))):
+        logging.getLogger("torchblur").warning("compiling for the CPU, once: about half a minute")

@@ -10,12 +10,13 @@ from __future__ import annotations
 import numpy as np
 
 from torchblur.bernstein import BISECTIONS, MAX_HALVINGS
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 
 MAX_DEGREE = 6  # of a difference of two nearnesses
+NARROW = 2.0**-50  # bracket of a root
 
 
-@jit
+@inlined
 def cubic_at(c: np.ndarray, row: int, k: int, u: float) -> float:
     """Return the value at `u` of the cubic whose coefficients are in a row of `c`, from column `k` on."""
     v = 1.0 - u
@@ -28,7 +29,7 @@ def cubic_at(c: np.ndarray, row: int, k: int, u: float) -> float:
     return v * a + u * b
 
 
-@jit
+@inlined
 def restrict_cubic(c: np.ndarray, row: int, k: int, part: tuple[float, float]) -> tuple[float, float, float, float]:
     """Return the coefficients on a part (start, end) of the cubic in a row of `c`, from column `k` on."""
     c0, c1, c2, c3 = c[row, k], c[row, k + 1], c[row, k + 2], c[row, k + 3]
@@ -107,13 +108,21 @@ def roots_of(room: np.ndarray, n: int, noise: float, found: np.ndarray) -> int:
             continue
         if changes == 1:
             low, high = 0.0, 1.0
-            for _ in range(BISECTIONS):
+            at_low, at_high = room[top, 0] * first, room[top, n - 1] * first
+            for step in range(2 * BISECTIONS):
                 middle = (low + high) / 2
-                if value_of(room, top, n, middle) * first > 0:
-                    low = middle
+                if step % 3 < 2 and at_low > 0 > at_high:  # false position, and each third time a bisection
+                    middle = min(max(low + (high - low) * (at_low / (at_low - at_high)), low), high)
+                at_middle = value_of(room, top, n, middle) * first
+                if at_middle > 0:
+                    if at_high < 0 and step % 3 == 1:
+                        at_high *= 0.5  # Illinois
+                    low, at_low = middle, at_middle
                 else:
-                    high = middle
-                if not low < (low + high) / 2 < high:
+                    if at_low > 0 and step % 3 == 1:
+                        at_low *= 0.5
+                    high, at_high = middle, at_middle
+                if not (high - low) * width > NARROW:
                     break
             if count < MAX_DEGREE:
                 found[count] = start + width * (low + high) / 2

@@ -16,7 +16,7 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cells import CROSSING_NOISE
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of, sort_by
 from torchblur.sort import TIE
 
@@ -82,14 +82,14 @@ def make_solver() -> Solver:
     return Solver(np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
 
 
-@jit
+@inlined
 def _local(ray: Ray, i: int, t: float) -> float:
     """Return where in interval `i` the time `t` lies, in [0, 1]."""
     start, end = ray.data[i, T_START], ray.data[i, T_END]
     return min(max((t - start) / (end - start), 0.0), 1.0)
 
 
-@jit
+@inlined
 def _nearness(ray: Ray, i: int, t: float) -> float:
     u = _local(ray, i, t)
     den = cubic_at(ray.data, i, DEN, u)
@@ -176,7 +176,7 @@ def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float,
     return first
 
 
-@jit
+@inlined
 def _largest(a: float, b: float, c: float, d: float) -> float:
     return max(max(abs(a), abs(b)), max(abs(c), abs(d)))
 

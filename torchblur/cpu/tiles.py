@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import sort_by
 from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START, Ray, make_ray
 from torchblur.hidden import CLEARLY
@@ -24,7 +24,7 @@ from torchblur.pairs import ROUNDING
 from torchblur.prisms import BOUND_SLACK_PX
 
 SLICES = 8
-TILE_PX = 32
+TILE_PX = 16
 MOST_PIECES = 16  # more than the intervals of one pair
 EVERY = 16  # prisms after which the tile's cover is looked at anew
 PAIRS = np.array(list(itertools.combinations(range(6), 2)))
@@ -112,7 +112,7 @@ def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_p
     return int(min(max(first, low), high + 1)), int(max(min(last, high), low - 1))
 
 
-@jit
+@inlined
 def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window: tuple[float, float]) -> None:
     """Note that an opaque interval (start, end, least nearness) covers a ray."""
     start, end, nearness = interval
@@ -143,7 +143,7 @@ def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window:
         tile.least[pixel] = least
 
 
-@jit
+@inlined
 def _cover_of(tile: Tile, pixel: int, times: tuple[float, float], window: tuple[float, float]) -> float:
     """Return the nearness at which a ray is closed all through some time."""
     length = (window[1] - window[0]) / SLICES
@@ -167,7 +167,7 @@ def _grown(tile: Tile) -> Tile:
     return Tile(tile.place, data, prism, following, tile.last, tile.cover, tile.least, tile.run, tile.counts)
 
 
-@jit
+@inlined
 def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> None:
     """Find the intervals in which a prism covers a ray, `who`: prism, pixel of the tile, x and y in NDC."""
     k, pixel, x_ndc, y_ndc = who

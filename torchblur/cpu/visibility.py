@@ -19,6 +19,7 @@ from torchblur.camera import Ray
 from torchblur.cells import Cells
 from torchblur.cpu import blend
 from torchblur.cpu.instant import on_threads
+from torchblur.cpu.jit import announce
 from torchblur.cpu.sweep import DEN, LOW, NUM, T_END, T_START
 from torchblur.cpu.tiles import Geometry, View
 from torchblur.intervals import Intervals
@@ -60,6 +61,7 @@ def prepare(prisms: Prisms, survey: Survey, chosen: Tensor, shutters: tuple[Shut
 
     Source: ours.
     """
+    announce(blend.see_tiles)
     surfaces = prisms.surfaces
     order = chosen[torch.sort(survey.nearness[1, chosen], descending=True, stable=True).indices]
     face = prisms.face_of[order]

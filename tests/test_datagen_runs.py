@@ -393,7 +393,9 @@ def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path, storag
 
 def test_an_interrupt_ends_with_130_and_a_rerun_finishes(tmp_path):
     folder = tmp_path / "data"
-    driver = run_script(DRIVE, *command(folder, count=40, workers=1), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+    driver = run_script(
+        DRIVE, *command(folder, count=400, workers=1), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    )
     deadline = time.monotonic() + 60
     while not list((folder / "frames").glob("*.exr")) and time.monotonic() < deadline:
         time.sleep(0.01)

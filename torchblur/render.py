@@ -68,7 +68,8 @@ def render(  # noqa: PLR0913  all keywords but the first
             with mip levels) come on top, with gradients autograd keeps every block, and a single ray
             that needs more gets it.
         backend: "torch": any device, gradients; "cpu": compiled, for scenes on the CPU without gradients; "auto": the
-            compiled one where it can be and results are float32. They agree within 2e-5.
+            compiled one where it can be and results are float32. They agree within 2e-5 but where surfaces lie in
+            one plane to about 1e-11 of their depth: which of these is in front may differ.
 
     Returns:
         A frame with `rgba` (H, W, 4), `coverage` (H, W, M), `shadow` (H, W) or None, counts, timings and the plan.

@@ -12,9 +12,10 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.cells import MIN_CELL
+from torchblur.cpu.batch import make_batch
 from torchblur.cpu.coverage import make_work
 from torchblur.cpu.jit import jit
-from torchblur.cpu.sweep import N_NUMBERS, Cells, Ray, make_cells, make_ray, make_solver, sweep
+from torchblur.cpu.sweep import N_NUMBERS, NO_ROOM, PRISM, Cells, Ray, make_cells, make_ray, make_solver, sweep
 from torchblur.cpu.tiles import TILE_PX, Geometry, View, fill_tile, gather_ray, make_tile
 
 N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
@@ -65,39 +66,46 @@ def _integral(colours: Colours, s: int, t: float) -> float:
 
 @jit
 def _composite(
-    colours: Colours, ray: Ray, cells: Cells, room: tuple[np.ndarray, np.ndarray], out: tuple[np.ndarray, int, int]
+    colours: Colours,
+    ray: Ray,
+    seen_in: tuple[Cells, int],
+    room: tuple[np.ndarray, np.ndarray],
+    out: tuple[np.ndarray, int, int],
 ) -> None:
     """Add what the cells of a ray show to a pixel of an image (H, W, S, C).
 
     Args:
-        colours, ray, cells: what is seen.
+        colours, ray: what is seen.
+        seen_in: cells of the ray, and their number.
         room: (3, S) delays of the line, areas of the weights, and room; (M,) int64 room.
         out: the image, row and column.
     """
     image, row, column = out
     delays, seen = room
+    t, first, layer, mark = seen_in[0].t, seen_in[0].first, seen_in[0].layer, ray.mark
+    opacity, rgb, mesh_of, cutoff = colours.opacity, colours.rgb, colours.mesh, colours.cutoff
     n_shutters = image.shape[2]
     for k in range(len(seen)):
         seen[k] = 0
-    for k in range(cells.count[0]):
+    for k in range(seen_in[1]):
         for s in range(n_shutters):
-            start, end = cells.t[k, 0] - delays[0, s], cells.t[k, 1] - delays[0, s]
+            start, end = t[k, 0] - delays[0, s], t[k, 1] - delays[0, s]
             delays[2, s] = (_integral(colours, s, end) - _integral(colours, s, start)) / delays[1, s]
         red, green, blue, left = 0.0, 0.0, 0.0, 1.0
-        for m in range(cells.first[k], cells.first[k + 1]):
-            prism = ray.prism[cells.layer[m]]
-            alpha = colours.opacity[prism]
+        for m in range(first[k], first[k + 1]):
+            prism = mark[layer[m], PRISM]
+            alpha = opacity[prism]
             weight = left * alpha
-            red += weight * colours.rgb[prism, 0]
-            green += weight * colours.rgb[prism, 1]
-            blue += weight * colours.rgb[prism, 2]
-            mesh = colours.mesh[prism]
+            red += weight * rgb[prism, 0]
+            green += weight * rgb[prism, 1]
+            blue += weight * rgb[prism, 2]
+            mesh = mesh_of[prism]
             if alpha > 0 and seen[mesh] != k + 1:
                 seen[mesh] = k + 1
                 for s in range(n_shutters):
                     image[row, column, s, N_LOOKS + mesh] += delays[2, s]
             left *= 1 - alpha
-            if not left > colours.cutoff:
+            if not left > cutoff:
                 break
         for s in range(n_shutters):
             image[row, column, s, 0] += delays[2, s] * red
@@ -145,15 +153,16 @@ def _with_room(listed: Listed, n: int) -> Listed:
 
 
 @jit
-def _list(listed: Listed, ray: Ray, n: int, cells: Cells, pixel: int) -> Listed:
+def _list(listed: Listed, ray: Ray, n: int, seen_in: tuple[Cells, int], pixel: int) -> Listed:
     """Append the intervals and the cells of a ray."""
-    size, count = listed.size, cells.count[0]
+    cells, count = seen_in
+    size = listed.size
     n_pixels, n_intervals, n_cells, n_layers = size[0], size[1], size[2], size[3]
     layers = cells.first[count]
     listed = _with_room(listed, max(max(n_pixels + 1, n_intervals + n), max(n_cells + count, n_layers + layers)))
     listed.pixel[n_pixels, 0], listed.pixel[n_pixels, 1], listed.pixel[n_pixels, 2] = pixel, n, count
     for k in range(n):
-        listed.prism[n_intervals + k] = ray.prism[k]
+        listed.prism[n_intervals + k] = ray.mark[k, PRISM]
         for c in range(N_NUMBERS):
             listed.data[n_intervals + k, c] = ray.data[k, c]
     for k in range(count):
@@ -191,7 +200,7 @@ def see_tiles(
     """
     which, offsets, prisms = bins
     n_across = (view.width + TILE_PX - 1) // TILE_PX
-    tile, work, solver = make_tile(), make_work(), make_solver()
+    tile, room, solver = make_tile(), (make_batch(), make_work()), make_solver()
     ray, cells = make_ray(64), make_cells(256, 1024)
     counts = np.zeros(len(COUNTS), np.int64)
     listed = _make_listed(FIRST_ROOM if mode != COMPOSITE else 1)
@@ -205,7 +214,7 @@ def see_tiles(
         x0, y0 = which_tile % n_across * TILE_PX, which_tile // n_across * TILE_PX
         width, height = min(TILE_PX, view.width - x0), min(TILE_PX, view.height - y0)
         tile.place[0], tile.place[1], tile.place[2], tile.place[3] = x0, y0, width, height
-        tile = fill_tile(geometry, view, tile, (prisms, offsets[which_tile], offsets[which_tile + 1]), work)
+        tile = fill_tile(geometry, view, tile, (prisms, offsets[which_tile], offsets[which_tile + 1]), room)
         for pixel in range(width * height):
             ray, n = gather_ray(geometry, tile, pixel, window, ray)
             if n == 0:
@@ -213,14 +222,17 @@ def see_tiles(
             column, row = x0 + pixel % width, y0 + pixel // width
             counts[0] += n
             counts[4] = max(counts[4], n)
-            cells.count[0] = cells.count[1] = 0
+            n_cells, n_crossings = 0, 0
             if mode != LIST_INTERVALS:
-                cells = sweep(ray, n, cells, shortest, solver)
-            counts[1] += cells.count[0]
-            counts[2] += cells.first[cells.count[0]]
-            counts[3] += cells.count[1]
+                n_cells, n_crossings = sweep(ray, n, cells, shortest, solver)
+                while n_cells == NO_ROOM:
+                    cells = make_cells(2 * len(cells.t), 2 * len(cells.layer))
+                    n_cells, n_crossings = sweep(ray, n, cells, shortest, solver)
+            counts[1] += n_cells
+            counts[2] += cells.first[n_cells]
+            counts[3] += n_crossings
             if mode != COMPOSITE:
-                listed = _list(listed, ray, n, cells, row * view.width + column)
+                listed = _list(listed, ray, n, (cells, n_cells), row * view.width + column)
                 continue
             for s in range(n_shutters):
                 way = colours.direction[s]
@@ -228,7 +240,7 @@ def see_tiles(
                 if way > RIGHT:
                     line = view.width - 1 - column
                 delays[0, s] = colours.delay[s] * line
-            _composite(colours, ray, cells, (delays, seen), (image, row, column))
+            _composite(colours, ray, (cells, n_cells), (delays, seen), (image, row, column))
     counts[5], counts[6] = tile.counts[1], tile.counts[2]
     return listed, counts
 

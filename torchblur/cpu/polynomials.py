@@ -10,29 +10,26 @@ from __future__ import annotations
 import numpy as np
 
 from torchblur.bernstein import BISECTIONS, MAX_HALVINGS
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import jit
 
 MAX_DEGREE = 6  # of a difference of two nearnesses
 NARROW = 2.0**-50  # bracket of a root
 
 
-@inlined
-def cubic_at(c: np.ndarray, row: int, k: int, u: float) -> float:
-    """Return the value at `u` of the cubic whose coefficients are in a row of `c`, from column `k` on."""
+@jit
+def cubic_at(c0: float, c1: float, c2: float, c3: float, u: float) -> float:
+    """Return the value at `u` of the cubic of four coefficients."""
     v = 1.0 - u
-    a, b, d = (
-        v * c[row, k] + u * c[row, k + 1],
-        v * c[row, k + 1] + u * c[row, k + 2],
-        v * c[row, k + 2] + u * c[row, k + 3],
-    )
+    a, b, d = v * c0 + u * c1, v * c1 + u * c2, v * c2 + u * c3
     a, b = v * a + u * b, v * b + u * d
     return v * a + u * b
 
 
-@inlined
-def restrict_cubic(c: np.ndarray, row: int, k: int, part: tuple[float, float]) -> tuple[float, float, float, float]:
-    """Return the coefficients on a part (start, end) of the cubic in a row of `c`, from column `k` on."""
-    c0, c1, c2, c3 = c[row, k], c[row, k + 1], c[row, k + 2], c[row, k + 3]
+@jit
+def restrict_cubic(
+    c0: float, c1: float, c2: float, c3: float, part: tuple[float, float]
+) -> tuple[float, float, float, float]:
+    """Return the coefficients on a part (start, end) of the cubic of four coefficients."""
     u, t = part
     v, s = 1.0 - u, 1.0 - t
     a0, a1, a2 = v * c0 + u * c1, v * c1 + u * c2, v * c2 + u * c3

@@ -4,6 +4,8 @@ Before: polynomials.py.  After: tiles.py.
 Symbols: n intervals of a ray in order of their starts; rows of `data` hold t_start, t_end, the Bernstein coefficients
 of M and D (see intervals.py), and the least and greatest nearness. A pair is certain until a time: up to then its
 order is known not to change.
+Arrays are looked up once, not inside loops: each look at one in a tuple counts a reference, which costs more than the
+arithmetic.
 Source: Ronnow et al. 2021, alg. 1 (the event sweep); order at midpoints and certificates as in cells.py; keeping
 certificates from cell to cell: ours.
 """
@@ -16,24 +18,24 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cells import CROSSING_NOISE
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import jit
 from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of, sort_by
 from torchblur.sort import TIE
 
 T_START, T_END, NUM, DEN, LOW, HIGH, N_NUMBERS = 0, 1, 2, 6, 10, 11, 12
+PRISM, RANK, IS_OPAQUE, UPPER, N_MARKS = 0, 1, 2, 3, 4
+NO_ROOM = -1
 
 
 class Ray(NamedTuple):
     """The intervals of one ray, and room to sweep over them."""
 
     data: np.ndarray  # (room, N_NUMBERS)
-    prism: np.ndarray  # (room,) int64
-    rank: np.ndarray  # (room,) int64 tie rank of the face
-    is_opaque: np.ndarray  # (room,) bool
+    mark: np.ndarray  # (room, N_MARKS) int64: prism, tie rank of the face, whether it is opaque, and UPPER: with which
+    #                   one its order in depth was last certified, -1 for none
+    until: np.ndarray  # (room,) time until which this order is certain
     by_end: np.ndarray  # (room,) int64
     active: np.ndarray  # (room,) int64 those that cover the ray now, nearest first
-    upper: np.ndarray  # (room,) int64 which one the order in depth below was last compared with, -1 for none
-    until: np.ndarray  # (room,) time until which this order is certain
 
 
 class Cells(NamedTuple):
@@ -42,7 +44,6 @@ class Cells(NamedTuple):
     t: np.ndarray  # (room, 2)
     first: np.ndarray  # (room + 1,) int64 first layer of each
     layer: np.ndarray  # (room,) int64 interval of the ray
-    count: np.ndarray  # (2,) int64 numbers of cells and of crossings
 
 
 class Solver(NamedTuple):
@@ -56,24 +57,13 @@ class Solver(NamedTuple):
 def make_ray(n: int) -> Ray:
     """Return room for `n` intervals."""
     ints = np.int64
-    return Ray(
-        np.empty((n, N_NUMBERS)),
-        np.empty(n, ints),
-        np.empty(n, ints),
-        np.empty(n, np.bool_),
-        np.empty(n, ints),
-        np.empty(n, ints),
-        np.empty(n, ints),
-        np.empty(n),
-    )
+    return Ray(np.empty((n, N_NUMBERS)), np.empty((n, N_MARKS), ints), np.empty(n), np.empty(n, ints), np.empty(n, ints))
 
 
 @jit
 def make_cells(n_cells: int, n_layers: int) -> Cells:
     """Return room for so many cells and layers."""
-    return Cells(
-        np.empty((n_cells, 2)), np.zeros(n_cells + 1, np.int64), np.empty(n_layers, np.int64), np.zeros(2, np.int64)
-    )
+    return Cells(np.empty((n_cells, 2)), np.zeros(n_cells + 1, np.int64), np.empty(n_layers, np.int64))
 
 
 @jit
@@ -82,50 +72,53 @@ def make_solver() -> Solver:
     return Solver(np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
 
 
-@inlined
-def _local(ray: Ray, i: int, t: float) -> float:
+@jit
+def _local(data: np.ndarray, i: int, t: float) -> float:
     """Return where in interval `i` the time `t` lies, in [0, 1]."""
-    start, end = ray.data[i, T_START], ray.data[i, T_END]
+    start, end = data[i, T_START], data[i, T_END]
     return min(max((t - start) / (end - start), 0.0), 1.0)
 
 
-@inlined
-def _nearness(ray: Ray, i: int, t: float) -> float:
-    u = _local(ray, i, t)
-    den = cubic_at(ray.data, i, DEN, u)
-    return cubic_at(ray.data, i, NUM, u) / den if den != 0 else np.inf
+@jit
+def _nearness(data: np.ndarray, i: int, t: float) -> float:
+    u = _local(data, i, t)
+    den = cubic_at(data[i, DEN], data[i, DEN + 1], data[i, DEN + 2], data[i, DEN + 3], u)
+    num = cubic_at(data[i, NUM], data[i, NUM + 1], data[i, NUM + 2], data[i, NUM + 3], u)
+    return num / den if den != 0 else np.inf
 
 
 @jit
-def _is_in_front(ray: Ray, i: int, j: int, start: float, end: float) -> bool:
-    """Return whether interval `i` is in front of `j` in the middle of a cell; see `cells._depth_order`."""
-    data = ray.data
+def _is_in_front(data: np.ndarray, mark: np.ndarray, pair: tuple[int, int], cell: tuple[float, float]) -> bool:
+    """Return whether the first of a pair is in front in the middle of a cell; see `cells._depth_order`."""
+    i, j = pair
     if data[i, LOW] > data[j, HIGH]:
         return True
     if data[j, LOW] > data[i, HIGH]:
         return False
+    start, end = cell
     for share in (0.5, 0.75):
         t = share * start + (1 - share) * end
-        a, b = _nearness(ray, i, t), _nearness(ray, j, t)
+        a, b = _nearness(data, i, t), _nearness(data, j, t)
         if a == b == np.inf:
             break
         if not abs(a - b) <= TIE * min(abs(a), abs(b)):
             return a > b
-    return ray.rank[i] < ray.rank[j]
+    return mark[i, RANK] < mark[j, RANK]
 
 
 @jit
 def _order(ray: Ray, n: int, start: float, end: float) -> int:
     """Put the active intervals in order of depth, down to the first opaque one, and return its place, or the last."""
-    active, opaque = ray.active, -1
+    data, mark, until, active = ray.data, ray.mark, ray.until, ray.active
+    opaque = -1
     for k in range(n):
         own = active[k]
         place = k
         if opaque >= 0:
             front = active[opaque]
-            if ray.upper[own] == front and ray.until[own] >= end:
+            if mark[own, UPPER] == front and until[own] >= end:
                 continue
-            if _is_in_front(ray, front, own, start, end):
+            if _is_in_front(data, mark, (front, own), (start, end)):
                 continue
             for m in range(k, opaque + 1, -1):
                 active[m] = active[m - 1]
@@ -133,39 +126,50 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
             place = opaque + 1
         while place > 0:
             above = active[place - 1]
-            if ray.upper[own] == above and ray.until[own] >= end:
+            if mark[own, UPPER] == above and until[own] >= end:
                 break
-            if not _is_in_front(ray, own, above, start, end):
+            if not _is_in_front(data, mark, (own, above), (start, end)):
                 break
             active[place], active[place - 1] = above, own
             place -= 1
         if opaque >= 0 and place <= opaque:
             opaque += 1
-        if ray.is_opaque[own] and (opaque < 0 or place < opaque):
+        if mark[own, IS_OPAQUE] != 0 and (opaque < 0 or place < opaque):
             opaque = place
     return opaque if opaque >= 0 else n - 1
 
 
 @jit
-def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
+def _first_crossing(data: np.ndarray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
     """Return the first time after `start`, by more than `least`, at which two intervals change places; or the first of
     their ends.
     """
-    data, f = ray.data, solver.room
     i, j = pair
     end = min(data[i, T_END], data[j, T_END])
-    part_i, part_j = (_local(ray, i, start), _local(ray, i, end)), (_local(ray, j, start), _local(ray, j, end))
-    a0, a1, a2, a3 = restrict_cubic(data, i, NUM, part_i)
-    b0, b1, b2, b3 = restrict_cubic(data, i, DEN, part_i)
-    p0, p1, p2, p3 = restrict_cubic(data, j, NUM, part_j)
-    q0, q1, q2, q3 = restrict_cubic(data, j, DEN, part_j)  # F = a q - p b
-    f[0, 0] = a0 * q0 - p0 * b0
-    f[0, 1] = 0.5 * ((a0 * q1 + a1 * q0) - (p0 * b1 + p1 * b0))
-    f[0, 2] = 0.2 * ((a0 * q2 + a2 * q0) - (p0 * b2 + p2 * b0)) + 0.6 * (a1 * q1 - p1 * b1)
-    f[0, 3] = 0.05 * ((a0 * q3 + a3 * q0) - (p0 * b3 + p3 * b0)) + 0.45 * ((a1 * q2 + a2 * q1) - (p1 * b2 + p2 * b1))
-    f[0, 4] = 0.2 * ((a1 * q3 + a3 * q1) - (p1 * b3 + p3 * b1)) + 0.6 * (a2 * q2 - p2 * b2)
-    f[0, 5] = 0.5 * ((a2 * q3 + a3 * q2) - (p2 * b3 + p3 * b2))
-    f[0, 6] = a3 * q3 - p3 * b3
+    a0, a1, a2, a3 = data[i, NUM], data[i, NUM + 1], data[i, NUM + 2], data[i, NUM + 3]
+    b0, b1, b2, b3 = data[i, DEN], data[i, DEN + 1], data[i, DEN + 2], data[i, DEN + 3]
+    p0, p1, p2, p3 = data[j, NUM], data[j, NUM + 1], data[j, NUM + 2], data[j, NUM + 3]
+    q0, q1, q2, q3 = data[j, DEN], data[j, DEN + 1], data[j, DEN + 2], data[j, DEN + 3]
+    if start > data[i, T_START] or end < data[i, T_END]:
+        u, v = _local(data, i, start), _local(data, i, end)
+        a0, a1, a2, a3 = restrict_cubic(a0, a1, a2, a3, (u, v))
+        b0, b1, b2, b3 = restrict_cubic(b0, b1, b2, b3, (u, v))
+    if start > data[j, T_START] or end < data[j, T_END]:
+        u, v = _local(data, j, start), _local(data, j, end)
+        p0, p1, p2, p3 = restrict_cubic(p0, p1, p2, p3, (u, v))
+        q0, q1, q2, q3 = restrict_cubic(q0, q1, q2, q3, (u, v))
+    f0 = a0 * q0 - p0 * b0  # F = a q - p b
+    f1 = 0.5 * ((a0 * q1 + a1 * q0) - (p0 * b1 + p1 * b0))
+    f2 = 0.2 * ((a0 * q2 + a2 * q0) - (p0 * b2 + p2 * b0)) + 0.6 * (a1 * q1 - p1 * b1)
+    f3 = 0.05 * ((a0 * q3 + a3 * q0) - (p0 * b3 + p3 * b0)) + 0.45 * ((a1 * q2 + a2 * q1) - (p1 * b2 + p2 * b1))
+    f4 = 0.2 * ((a1 * q3 + a3 * q1) - (p1 * b3 + p3 * b1)) + 0.6 * (a2 * q2 - p2 * b2)
+    f5 = 0.5 * ((a2 * q3 + a3 * q2) - (p2 * b3 + p3 * b2))
+    f6 = a3 * q3 - p3 * b3
+    most = max(max(max(f0, f1), max(f2, f3)), max(max(f4, f5), f6))
+    if most <= 0 or min(min(min(f0, f1), min(f2, f3)), min(min(f4, f5), f6)) >= 0:
+        return end
+    f = solver.room
+    f[0, 0], f[0, 1], f[0, 2], f[0, 3], f[0, 4], f[0, 5], f[0, 6] = f0, f1, f2, f3, f4, f5, f6
     size_i = _largest(a0, a1, a2, a3) * _largest(q0, q1, q2, q3)
     size_j = _largest(p0, p1, p2, p3) * _largest(b0, b1, b2, b3)
     first = end
@@ -176,7 +180,7 @@ def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float,
     return first
 
 
-@inlined
+@jit
 def _largest(a: float, b: float, c: float, d: float) -> float:
     return max(max(abs(a), abs(b)), max(abs(c), abs(d)))
 
@@ -188,53 +192,23 @@ def _certify(ray: Ray, n: int, opaque: int, cell: tuple[float, float, float], so
     if not end - start > least:
         return end
     until = end  # the order is that of the middle of all of the cell
-    data, active = ray.data, ray.active
+    data, mark, certain, active = ray.data, ray.mark, ray.until, ray.active
     for k in range(1, n):
         above, own = active[k - 1 if k <= opaque else opaque], active[k]
-        if data[above, LOW] > data[own, HIGH] or (ray.upper[own] == above and ray.until[own] >= end):
+        if data[above, LOW] > data[own, HIGH] or (mark[own, UPPER] == above and certain[own] >= end):
             continue
-        t = _first_crossing(ray, (above, own), start, least, solver)
+        t = _first_crossing(data, (above, own), start, least, solver)
         if until - t > least:
             end = min(end, t)
-            ray.upper[own] = -1
+            mark[own, UPPER] = -1
         else:
-            ray.upper[own], ray.until[own] = above, t
+            mark[own, UPPER], certain[own] = above, t
     return until if until - end <= least else end
 
 
 @jit
-def _emit(cells: Cells, ray: Ray, opaque: int, start: float, end: float) -> Cells:
-    """Append a cell, or make the last one longer where it shows the same."""
-    n, active = cells.count[0], ray.active
-    first = cells.first[n]
-    if n > 0 and cells.t[n - 1, 1] == start and first - cells.first[n - 1] == opaque + 1:
-        is_same, before = True, cells.first[n - 1]
-        for k in range(opaque + 1):
-            if cells.layer[before + k] != active[k]:
-                is_same = False
-                break
-        if is_same:
-            cells.t[n - 1, 1] = end
-            return cells
-    if n + 1 > len(cells.t) or first + opaque + 1 > len(cells.layer):
-        bigger = make_cells(max(2 * len(cells.t), n + 1), max(2 * len(cells.layer), first + opaque + 1))
-        for k in range(n):
-            bigger.t[k, 0], bigger.t[k, 1], bigger.first[k + 1] = cells.t[k, 0], cells.t[k, 1], cells.first[k + 1]
-        for k in range(first):
-            bigger.layer[k] = cells.layer[k]
-        bigger.count[0], bigger.count[1] = cells.count[0], cells.count[1]
-        cells = bigger
-    cells.t[n, 0], cells.t[n, 1] = start, end
-    for k in range(opaque + 1):
-        cells.layer[first + k] = active[k]
-    cells.first[n + 1] = first + opaque + 1
-    cells.count[0] = n + 1
-    return cells
-
-
-@jit
-def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> Cells:
-    """Return the cells of a ray, written to `cells` or, where these have no room, to larger ones.
+def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> tuple[int, int]:
+    """Write the cells of a ray to `cells`, and return their number and that of crossings; NO_ROOM where they are more.
 
     Args:
         ray: its intervals in order of their starts.
@@ -245,11 +219,12 @@ def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> Ce
 
     Source: Ronnow et al. 2021, alg. 1.
     """
-    cells.count[0] = cells.count[1] = 0
-    data, by_end, active = ray.data, ray.by_end, ray.active
+    data, mark, by_end, active = ray.data, ray.mark, ray.by_end, ray.active
+    t, first, layer = cells.t, cells.first, cells.layer
+    n_cells, n_layers, n_crossings, last = 0, 0, 0, 0
     for k in range(n):
         by_end[k] = k
-        ray.upper[k] = -1
+        mark[k, UPPER] = -1
     sort_by(data, T_END, by_end, n)
     now, next_start, next_end, n_active = data[0, T_START], 0, 0, 0
     while True:
@@ -266,19 +241,37 @@ def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> Ce
             n_active += 1
             next_start += 1
         if next_end == n:
-            return cells
+            return n_cells, n_crossings
         event = data[by_end[next_end], T_END]
         if next_start < n:
             event = min(event, data[next_start, T_START])
         while n_active > 0 and now < event:
-            end = event
-            while True:
+            end, opaque = event, 0
+            while n_active > 1:
                 opaque = _order(ray, n_active, now, end)
                 certain = _certify(ray, n_active, opaque, (now, end, shortest), solver)
                 if not certain < end:
                     break
                 end = certain
-                cells.count[1] += 1
-            cells = _emit(cells, ray, opaque, now, end)
+                n_crossings += 1
+            # a cell that shows the same as the last one makes it longer
+            is_same = n_cells > 0 and t[n_cells - 1, 1] == now and n_layers - last == opaque + 1
+            if is_same:
+                for k in range(opaque + 1):
+                    if layer[last + k] != active[k]:
+                        is_same = False
+                        break
+            if is_same:
+                t[n_cells - 1, 1] = end
+            else:
+                if n_cells == len(t) or n_layers + opaque + 1 > len(layer):
+                    return NO_ROOM, 0
+                t[n_cells, 0], t[n_cells, 1] = now, end
+                last = n_layers
+                for k in range(opaque + 1):
+                    layer[n_layers + k] = active[k]
+                n_cells += 1
+                n_layers += opaque + 1
+                first[n_cells] = n_layers
             now = end
         now = event

@@ -14,10 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from torchblur.cpu import batch as batches
+from torchblur.cpu.batch import Batch
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import jit
 from torchblur.cpu.polynomials import sort_by
-from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START, Ray, make_ray
+from torchblur.cpu.sweep import DEN, HIGH, IS_OPAQUE, LOW, N_NUMBERS, NUM, PRISM, RANK, T_END, T_START, Ray, make_ray
 from torchblur.hidden import CLEARLY
 from torchblur.intervals import SHORTEST
 from torchblur.pairs import ROUNDING
@@ -27,6 +29,7 @@ SLICES = 8
 TILE_PX = 16
 MOST_PIECES = 16  # more than the intervals of one pair
 EVERY = 16  # prisms after which the tile's cover is looked at anew
+WIDE = 5  # columns from which on the hull of a prism is worth its cost
 PAIRS = np.array(list(itertools.combinations(range(6), 2)))
 X, Y, W, Z = 0, 1, 2, 3
 
@@ -112,63 +115,63 @@ def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_p
     return int(min(max(first, low), high + 1)), int(max(min(last, high), low - 1))
 
 
-@inlined
+@jit
 def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window: tuple[float, float]) -> None:
     """Note that an opaque interval (start, end, least nearness) covers a ray."""
     start, end, nearness = interval
+    cover, run = tile.cover, tile.run
     length = (window[1] - window[0]) / SLICES
     first = min(max(int((start - window[0]) / length), 0), SLICES - 1)
     last = min(max(int((end - window[0]) / length), 0), SLICES - 1)
     is_closer = False
     for s in range(first, last + 1):
-        if nearness <= tile.cover[pixel, s]:
+        if nearness <= cover[pixel, s]:
             continue
         opens = window[0] + s * length
         closes = window[0] + (s + 1) * length if s < SLICES - 1 else window[1]
         a, b = max(start, opens), min(end, closes)
-        run = tile.run
         if a <= run[pixel, s, 1] and b >= run[pixel, s, 0]:
             a, b = min(a, run[pixel, s, 0]), max(b, run[pixel, s, 1])
             run[pixel, s, 0], run[pixel, s, 1], run[pixel, s, 2] = a, b, min(nearness, run[pixel, s, 2])
         elif b - a > run[pixel, s, 1] - run[pixel, s, 0]:
             run[pixel, s, 0], run[pixel, s, 1], run[pixel, s, 2] = a, b, nearness
         if run[pixel, s, 0] <= opens and run[pixel, s, 1] >= closes:
-            tile.cover[pixel, s] = max(tile.cover[pixel, s], run[pixel, s, 2])
+            cover[pixel, s] = max(cover[pixel, s], run[pixel, s, 2])
             run[pixel, s, 0], run[pixel, s, 1] = np.inf, -np.inf
             is_closer = True
     if is_closer:
-        least = tile.cover[pixel, 0]
+        least = cover[pixel, 0]
         for s in range(1, SLICES):
-            least = min(least, tile.cover[pixel, s])
+            least = min(least, cover[pixel, s])
         tile.least[pixel] = least
 
 
-@inlined
-def _cover_of(tile: Tile, pixel: int, times: tuple[float, float], window: tuple[float, float]) -> float:
+@jit
+def _cover_of(cover: np.ndarray, pixel: int, times: tuple[float, float], window: tuple[float, float]) -> float:
     """Return the nearness at which a ray is closed all through some time."""
-    length = (window[1] - window[0]) / SLICES
-    first = min(max(int((times[0] - window[0]) / length), 0), SLICES - 1)
-    last = min(max(int((times[1] - window[0]) / length), 0), SLICES - 1)
-    least = tile.cover[pixel, first]
+    scale = SLICES / (window[1] - window[0])
+    first = min(max(int((times[0] - window[0]) * scale), 0), SLICES - 1)
+    last = min(max(int((times[1] - window[0]) * scale), 0), SLICES - 1)
+    least = cover[pixel, first]
     for s in range(first + 1, last + 1):
-        least = min(least, tile.cover[pixel, s])
+        least = min(least, cover[pixel, s])
     return least
 
 
 @jit
-def _grown(tile: Tile) -> Tile:
-    """Return the tile with twice the room for intervals."""
-    n = len(tile.prism)
-    data, prism, following = np.empty((2 * n, N_NUMBERS)), np.empty(2 * n, np.int64), np.empty(2 * n, np.int64)
-    for k in range(n):
-        prism[k], following[k] = tile.prism[k], tile.next[k]
-        for c in range(N_NUMBERS):
-            data[k, c] = tile.data[k, c]
+def _with_room(tile: Tile, n: int) -> Tile:
+    """Return the tile with room for `n` intervals more."""
+    have = tile.counts[0]
+    if have + n <= len(tile.prism):
+        return tile
+    most = max(2 * len(tile.prism), have + n)
+    data, prism, following = np.empty((most, N_NUMBERS)), np.empty(most, np.int64), np.empty(most, np.int64)
+    data[:have], prism[:have], following[:have] = tile.data[:have], tile.prism[:have], tile.next[:have]
     return Tile(tile.place, data, prism, following, tile.last, tile.cover, tile.least, tile.run, tile.counts)
 
 
-@inlined
-def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> None:
+@jit
+def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> None:
     """Find the intervals in which a prism covers a ray, `who`: prism, pixel of the tile, x and y in NDC."""
     k, pixel, x_ndc, y_ndc = who
     corner, clip = work.corner, geometry.clip
@@ -179,12 +182,8 @@ def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, floa
             corner[end, c, 1] = clip[k, end, c, Y] - y_ndc * w
             corner[end, c, 2], corner[end, c, 3] = w, clip[k, end, c, Z]
     n_pieces = find_pieces(work, geometry.is_clipped[k], geometry.is_still[k], geometry.allowed[k])
-    window, opens, closes = (view.start, view.end), geometry.t[k, 0], geometry.t[k, 1]
     for m in range(n_pieces):
         start, end = work.piece[m, 0], work.piece[m, 1]
-        t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
-        if not t_end - t_start > SHORTEST * (view.end - view.start):
-            continue
         n, data = tile.counts[0], tile.data
         nearness_of(work, start, end, view.orders_by_w, (data, n, NUM))
         is_front, is_back, low, high = True, True, np.inf, -np.inf
@@ -195,18 +194,84 @@ def _solve(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, floa
             low, high = min(low, ratio), max(high, ratio)
         if not (is_front or is_back):
             low, high = -np.inf, np.inf
-        if high < (1 - CLEARLY) * _cover_of(tile, pixel, (t_start, t_end), window):
-            continue
-        data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = t_start, t_end, low, high
-        tile.prism[n], tile.next[n] = k, tile.last[pixel]
-        tile.last[pixel] = n
-        tile.counts[0] = n + 1
-        if geometry.hides[k] and low > 0:
-            _close(tile, pixel, (t_start, t_end, low), window)
+        _keep(geometry, view, tile, (k, pixel), (start, end, low, high))
 
 
 @jit
-def fill_tile(geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarray, int, int], work: Work) -> Tile:
+def _keep(
+    geometry: Geometry, view: View, tile: Tile, who: tuple[int, int], found: tuple[float, float, float, float]
+) -> None:
+    """Add an interval whose M and D are written already, unless it is hidden; `found`: local times and nearness."""
+    k, pixel = who
+    start, end, low, high = found
+    opens, closes = geometry.t[k, 0], geometry.t[k, 1]
+    t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
+    window = (view.start, view.end)
+    if not t_end - t_start > SHORTEST * (view.end - view.start):
+        return
+    if high < (1 - CLEARLY) * _cover_of(tile.cover, pixel, (t_start, t_end), window):
+        return
+    data, n = tile.data, tile.counts[0]
+    data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = t_start, t_end, low, high
+    tile.prism[n], tile.next[n] = k, tile.last[pixel]
+    tile.last[pixel] = n
+    tile.counts[0] = n + 1
+    if geometry.hides[k] and low > 0:
+        _close(tile, pixel, (t_start, t_end, low), window)
+
+
+@jit
+def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, work: Work) -> Tile:
+    """Find the intervals of the `n` pairs of a batch."""
+    field, near, who, covered = batch.field, batch.near, batch.who, batch.covered
+    batches.solve(field, n)
+    n_covered = batches.gather_covered(batch, n)
+    batches.restrict(near, n_covered)
+    tile = _with_room(tile, n_covered)
+    data = tile.data
+    n_hard, room = n - n_covered, batches.ROOM
+    for m in range(n_covered):
+        if near[batches.WEAK + np.uint64(m)] != 0:
+            field[batches.STATE + np.uint64(covered[m])] = batches.HARD
+            continue
+        place = tile.counts[0]
+        for c in range(8):
+            data[place, NUM + c] = near[c * room + m]
+        k, pixel = who[covered[m], 0], who[covered[m], 2]
+        f = np.uint64(m)
+        found = near[f + batches.FROM], near[f + batches.TO], near[f + batches.LOW], near[f + batches.HIGH]
+        _keep(geometry, view, tile, (k, pixel), found)
+    x0, y0, width = tile.place[0], tile.place[1], tile.place[2]
+    for m in range(n):
+        if field[batches.STATE + np.uint64(m)] == batches.HARD:
+            pixel = who[m, 2]
+            ray = _ray_of(view, x0 + pixel % width, y0 + pixel // width)
+            tile = _with_room(tile, MOST_PIECES)
+            _solve_hard(geometry, view, tile, (who[m, 0], pixel, ray[0], ray[1]), work)
+    return tile
+
+
+@jit
+def _ray_of(view: View, column: int, row: int) -> tuple[float, float]:
+    """Return x and y of a pixel's ray in NDC."""
+    return 2 * (column + view.x_px) / view.width - 1, 1 - 2 * (row + view.y_px) / view.height
+
+
+@jit
+def _clear(tile: Tile) -> None:
+    """Forget what covers the tile."""
+    last, least, cover, run = tile.last, tile.least, tile.cover, tile.run
+    tile.counts[0] = 0
+    for pixel in range(tile.place[2] * tile.place[3]):
+        last[pixel], least[pixel] = -1, 0.0
+        for k in range(SLICES):
+            cover[pixel, k], run[pixel, k, 0], run[pixel, k, 1] = 0.0, np.inf, -np.inf
+
+
+@jit
+def fill_tile(
+    geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarray, int, int], room: tuple[Batch, Work]
+) -> Tile:
     """Find the intervals of all rays of a tile.
 
     Args:
@@ -214,25 +279,26 @@ def fill_tile(geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarra
         view: the image.
         tile: whose place is set.
         which: prisms, and the first and last (exclusive) of those that may touch the tile; these ascend.
-        work: room.
+        room: for pairs that are solved together, and for single ones.
 
     Source: ours.
     """
+    batch, work = room
     x0, y0, width, height = tile.place[0], tile.place[1], tile.place[2], tile.place[3]
     prisms, first, last = which
-    n_pixels = width * height
-    tile.counts[0] = 0
-    for pixel in range(n_pixels):
-        tile.last[pixel], tile.least[pixel] = -1, 0.0
-        for k in range(SLICES):
-            tile.cover[pixel, k], tile.run[pixel, k, 0], tile.run[pixel, k, 1] = 0.0, np.inf, -np.inf
-    least = 0.0
+    _clear(tile)
+    x_first, y_first = _ray_of(view, x0, y0)
+    x_last, y_last = _ray_of(view, x0 + width - 1, y0 + height - 1)
+    x_middle, y_middle = 0.5 * (x_first + x_last), 0.5 * (y_first + y_last)
+    middle = (x_middle, y_middle, 0.5 * (x_last - x_first), 0.5 * (y_first - y_last))
+    window, bounds, who, pixels = (view.start, view.end), geometry.bounds_px, batch.who, batch.pixels
+    least, n, row_of = 0.0, 0, 0
     for m in range(first, last):
         k = prisms[m]
-        high, bounds = geometry.high[k], geometry.bounds_px
+        high = geometry.high[k]
         if (m - first) % EVERY == 0:
             least = np.inf
-            for pixel in range(n_pixels):
+            for pixel in range(width * height):
                 least = min(least, tile.least[pixel])
         if high < (1 - CLEARLY) * least:
             break
@@ -240,49 +306,76 @@ def fill_tile(geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarra
         last_row = int(min(np.floor(min(bounds[k, 3], float(view.height)) - view.y_px), y0 + height - 1))
         low = int(max(np.ceil(max(bounds[k, 0], -1.0) - view.x_px), x0))
         most = int(min(np.floor(min(bounds[k, 2], float(view.width)) - view.x_px), x0 + width - 1))
-        if low > most:
+        if low > most or first_row > last_row:
             continue
-        times, window = (geometry.t[k, 0], geometry.t[k, 1]), (view.start, view.end)
+        times = (geometry.t[k, 0], geometry.t[k, 1])
         is_whole = times[0] <= view.start and times[1] >= view.end
+        is_set_up, is_hard, allowed = False, geometry.is_clipped[k], float(geometry.allowed[k])
         for row in range(first_row, last_row + 1):
-            left, right = _columns(geometry.corners_px, k, row + view.y_px, (low, most), view.x_px)
-            y_ndc = 1 - 2 * (row + view.y_px) / view.height
-            for column in range(left, right + 1):
-                pixel = (row - y0) * width + column - x0
-                cover = tile.least[pixel] if is_whole else _cover_of(tile, pixel, times, window)
+            left, right = low, most
+            if most - low >= WIDE:
+                left, right = _columns(geometry.corners_px, k, row + view.y_px, (low, most), view.x_px)
+            count = 0
+            for column in range(left - x0, right + 1 - x0):
+                pixel = (row - y0) * width + column
+                cover = tile.least[pixel] if is_whole else _cover_of(tile.cover, pixel, times, window)
                 if high < (1 - CLEARLY) * cover:
                     tile.counts[2] += 1
                     continue
-                tile.counts[1] += 1
-                x_ndc = 2 * (column + view.x_px) / view.width - 1
-                if tile.counts[0] + MOST_PIECES > len(tile.prism):
-                    tile = _grown(tile)
-                _solve(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
-    return tile
+                pixels[count] = column
+                count += 1
+            if count == 0:
+                continue
+            tile.counts[1] += count
+            if not (is_set_up or is_hard):
+                is_set_up = True
+                is_hard = not batches.set_up(geometry.clip, k, middle, view.orders_by_w, (batch.setup, row_of))
+            if is_hard:
+                tile = _with_room(tile, MOST_PIECES * count)
+                for m_pixel in range(count):
+                    x_ndc, y_ndc = _ray_of(view, x0 + pixels[m_pixel], row)
+                    pixel = (row - y0) * width + pixels[m_pixel]
+                    _solve_hard(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
+                continue
+            y = _ray_of(view, x0, row)[1] - y_middle
+            batches.add_row(batch, n, (row_of, allowed, y, count), (x_first - x_middle, 2 / view.width))
+            for m_pixel in range(count):
+                who[n, 0], who[n, 1], who[n, 2] = k, row_of, (row - y0) * width + pixels[m_pixel]
+                n += 1
+            if n > batches.ROOM - TILE_PX:
+                tile = _flush(geometry, view, tile, batch, n, work)
+                for c in range(batches.N_SETUP):
+                    batch.setup[0, c] = batch.setup[row_of, c]
+                n, row_of = 0, 0
+        if is_set_up and not is_hard:
+            row_of = row_of + 1 if n > 0 else 0
+    return _flush(geometry, view, tile, batch, n, work)
 
 
 @jit
 def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, float], ray: Ray) -> tuple[Ray, int]:
     """Return the intervals of a ray that are not hidden in order of their starts, and their number."""
-    n, i = 0, tile.last[pixel]
+    following, found, cover, last = tile.next, tile.data, tile.cover, tile.last[pixel]
+    n, i = 0, last
     while i >= 0:
         n += 1
-        i = tile.next[i]
-    if n > len(ray.prism):
+        i = following[i]
+    if n > len(ray.until):
         ray = make_ray(2 * n)
-    n, i = 0, tile.last[pixel]
+    active = ray.active
+    n, i = 0, last
     while i >= 0:
-        times = tile.data[i, T_START], tile.data[i, T_END]
-        if tile.data[i, HIGH] >= (1 - CLEARLY) * _cover_of(tile, pixel, times, window):
-            ray.active[n] = i
+        if found[i, HIGH] >= (1 - CLEARLY) * _cover_of(cover, pixel, (found[i, T_START], found[i, T_END]), window):
+            active[n] = i
             n += 1
-        i = tile.next[i]
-    sort_by(tile.data, T_START, ray.active, n)
+        i = following[i]
+    sort_by(found, T_START, active, n)
+    data, mark, prism = ray.data, ray.mark, tile.prism
+    scene_prism, rank, is_opaque = geometry.prism, geometry.rank, geometry.is_opaque
     for m in range(n):
-        i = ray.active[m]
-        k = tile.prism[i]
+        i = active[m]
+        k = prism[i]
         for c in range(N_NUMBERS):
-            ray.data[m, c] = tile.data[i, c]
-        ray.prism[m], ray.rank[m] = geometry.prism[k], geometry.rank[k]
-        ray.is_opaque[m] = geometry.is_opaque[k]
+            data[m, c] = found[i, c]
+        mark[m, PRISM], mark[m, RANK], mark[m, IS_OPAQUE] = scene_prism[k], rank[k], is_opaque[k]
     return ray, n

@@ -159,16 +159,21 @@ def set_up(
 
 
 @jit
-def add_row(batch: Batch, n: int, who: tuple[int, float, float, int], x: tuple[float, float]) -> None:
-    """Append pairs of a prism with rays of one row to a batch that holds `n`; `pixels` holds their columns.
+def add_row(
+    room: tuple[np.ndarray, np.ndarray, np.ndarray],
+    n: int,
+    who: tuple[int, float, float, int],
+    x: tuple[float, float],
+) -> None:
+    """Append pairs of a prism with rays of one row to a batch that holds `n`.
 
     Args:
-        batch: what to fill.
+        room: `setup`, `field` and `pixels` of the batch, of which the last holds the columns.
         n: pairs in it.
         who: prism's row of `setup`, sign of the edges that is seen, Y, and how many pairs.
         x: X of the tile's first column, and from one to the next.
     """
-    field, setup, pixels = batch.field, batch.setup, batch.pixels
+    setup, field, pixels = room
     row, allowed, y, count = who
     noise = setup[row, NOISE_AT]
     at, step = x

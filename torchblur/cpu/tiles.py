@@ -32,6 +32,7 @@ EVERY = 16  # prisms after which the tile's cover is looked at anew
 WIDE = 5  # columns from which on the hull of a prism is worth its cost
 PAIRS = np.array(list(itertools.combinations(range(6), 2)))
 X, Y, W, Z = 0, 1, 2, 3
+_U = np.uint64  # see batch.py
 
 
 class Geometry(NamedTuple):
@@ -116,13 +117,13 @@ def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_p
 
 
 @jit
-def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window: tuple[float, float]) -> None:
-    """Note that an opaque interval (start, end, least nearness) covers a ray."""
+def _close(
+    cover: np.ndarray, run: np.ndarray, pixel: int, interval: tuple[float, float, float], window: tuple[float, float]
+) -> bool:
+    """Note that an opaque interval (start, end, least nearness) covers a ray; return whether this closes a slice."""
     start, end, nearness = interval
-    cover, run = tile.cover, tile.run
     length = (window[1] - window[0]) / SLICES
-    first = min(max(int((start - window[0]) / length), 0), SLICES - 1)
-    last = min(max(int((end - window[0]) / length), 0), SLICES - 1)
+    first, last = _slices((start, end), window)
     is_closer = False
     for s in range(first, last + 1):
         if nearness <= cover[pixel, s]:
@@ -139,19 +140,21 @@ def _close(tile: Tile, pixel: int, interval: tuple[float, float, float], window:
             cover[pixel, s] = max(cover[pixel, s], run[pixel, s, 2])
             run[pixel, s, 0], run[pixel, s, 1] = np.inf, -np.inf
             is_closer = True
-    if is_closer:
-        least = cover[pixel, 0]
-        for s in range(1, SLICES):
-            least = min(least, cover[pixel, s])
-        tile.least[pixel] = least
+    return is_closer
+
+
+@jit
+def _slices(times: tuple[float, float], window: tuple[float, float]) -> tuple[int, int]:
+    """Return the first and the last slice that a time reaches."""
+    scale = SLICES / (window[1] - window[0])
+    first, last = int((times[0] - window[0]) * scale), int((times[1] - window[0]) * scale)
+    return min(max(first, 0), SLICES - 1), min(max(last, 0), SLICES - 1)
 
 
 @jit
 def _cover_of(cover: np.ndarray, pixel: int, times: tuple[float, float], window: tuple[float, float]) -> float:
     """Return the nearness at which a ray is closed all through some time."""
-    scale = SLICES / (window[1] - window[0])
-    first = min(max(int((times[0] - window[0]) * scale), 0), SLICES - 1)
-    last = min(max(int((times[1] - window[0]) * scale), 0), SLICES - 1)
+    first, last = _slices(times, window)
     least = cover[pixel, first]
     for s in range(first + 1, last + 1):
         least = min(least, cover[pixel, s])
@@ -182,9 +185,9 @@ def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int,
             corner[end, c, 1] = clip[k, end, c, Y] - y_ndc * w
             corner[end, c, 2], corner[end, c, 3] = w, clip[k, end, c, Z]
     n_pieces = find_pieces(work, geometry.is_clipped[k], geometry.is_still[k], geometry.allowed[k])
+    first, data = tile.counts[0], tile.data
     for m in range(n_pieces):
-        start, end = work.piece[m, 0], work.piece[m, 1]
-        n, data = tile.counts[0], tile.data
+        start, end, n = work.piece[m, 0], work.piece[m, 1], first + m
         nearness_of(work, start, end, view.orders_by_w, (data, n, NUM))
         is_front, is_back, low, high = True, True, np.inf, -np.inf
         for c in range(4):
@@ -194,30 +197,43 @@ def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int,
             low, high = min(low, ratio), max(high, ratio)
         if not (is_front or is_back):
             low, high = -np.inf, np.inf
-        _keep(geometry, view, tile, (k, pixel), (start, end, low, high))
+        data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = start, end, low, high
+        tile.prism[n], tile.next[n] = k, pixel
+    _keep(geometry, view, tile, n_pieces)
 
 
 @jit
-def _keep(
-    geometry: Geometry, view: View, tile: Tile, who: tuple[int, int], found: tuple[float, float, float, float]
-) -> None:
-    """Add an interval whose M and D are written already, unless it is hidden; `found`: local times and nearness."""
-    k, pixel = who
-    start, end, low, high = found
-    opens, closes = geometry.t[k, 0], geometry.t[k, 1]
-    t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
-    window = (view.start, view.end)
-    if not t_end - t_start > SHORTEST * (view.end - view.start):
-        return
-    if high < (1 - CLEARLY) * _cover_of(tile.cover, pixel, (t_start, t_end), window):
-        return
-    data, n = tile.data, tile.counts[0]
-    data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = t_start, t_end, low, high
-    tile.prism[n], tile.next[n] = k, tile.last[pixel]
-    tile.last[pixel] = n
-    tile.counts[0] = n + 1
-    if geometry.hides[k] and low > 0:
-        _close(tile, pixel, (t_start, t_end, low), window)
+def _keep(geometry: Geometry, view: View, tile: Tile, n: int) -> None:
+    """Take over `n` intervals that follow those of the tile, with local times and `next` their pixel: in shutter time,
+    linked, and without those that are hidden.
+    """
+    data, prism, following, last_of = tile.data, tile.prism, tile.next, tile.last
+    cover, run, least_of = tile.cover, tile.run, tile.least
+    t, hides = geometry.t, geometry.hides
+    window, shortest, place = (view.start, view.end), SHORTEST * (view.end - view.start), tile.counts[0]
+    first = place
+    for m in range(first, first + n):
+        k, pixel, start, end, low, high = prism[m], following[m], data[m, T_START], data[m, T_END], data[m, LOW], data[m, HIGH]
+        opens, closes = t[k, 0], t[k, 1]
+        t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
+        if not t_end - t_start > shortest:
+            continue
+        if high < (1 - CLEARLY) * _cover_of(cover, pixel, (t_start, t_end), window):
+            continue
+        if place != m:
+            prism[place] = k
+            for c in range(N_NUMBERS):
+                data[place, c] = data[m, c]
+        data[place, T_START], data[place, T_END] = t_start, t_end
+        following[place] = last_of[pixel]
+        last_of[pixel] = place
+        place += 1
+        if hides[k] and low > 0 and _close(cover, run, pixel, (t_start, t_end, low), window):
+            least = cover[pixel, 0]
+            for s in range(1, SLICES):
+                least = min(least, cover[pixel, s])
+            least_of[pixel] = least
+    tile.counts[0] = place
 
 
 @jit
@@ -228,26 +244,30 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
     n_covered = batches.gather_covered(batch, n)
     batches.restrict(near, n_covered)
     tile = _with_room(tile, n_covered)
-    data = tile.data
-    n_hard, room = n - n_covered, batches.ROOM
-    for m in range(n_covered):
-        if near[batches.WEAK + np.uint64(m)] != 0:
-            field[batches.STATE + np.uint64(covered[m])] = batches.HARD
+    data, prism, following, first, count = tile.data, tile.prism, tile.next, tile.counts[0], 0
+    for m in range(_U(n_covered)):
+        pair = covered[m]
+        if near[m + batches.WEAK] != 0:
+            field[_U(pair) + batches.STATE] = batches.HARD
             continue
-        place = tile.counts[0]
+        place = first + count
         for c in range(8):
-            data[place, NUM + c] = near[c * room + m]
-        k, pixel = who[covered[m], 0], who[covered[m], 2]
-        f = np.uint64(m)
-        found = near[f + batches.FROM], near[f + batches.TO], near[f + batches.LOW], near[f + batches.HIGH]
-        _keep(geometry, view, tile, (k, pixel), found)
-    x0, y0, width = tile.place[0], tile.place[1], tile.place[2]
-    for m in range(n):
-        if field[batches.STATE + np.uint64(m)] == batches.HARD:
-            pixel = who[m, 2]
-            ray = _ray_of(view, x0 + pixel % width, y0 + pixel // width)
-            tile = _with_room(tile, MOST_PIECES)
-            _solve_hard(geometry, view, tile, (who[m, 0], pixel, ray[0], ray[1]), work)
+            data[place, NUM + c] = near[m + _U(c * batches.ROOM)]
+        data[place, T_START], data[place, T_END] = near[m + batches.FROM], near[m + batches.TO]
+        data[place, LOW], data[place, HIGH] = near[m + batches.LOW], near[m + batches.HIGH]
+        prism[place], following[place] = who[pair, 0], who[pair, 2]
+        count += 1
+    _keep(geometry, view, tile, count)
+    n_hard = 0  # listed first: a loop over all that may call would count references for each
+    for m in range(_U(n)):
+        if field[m + batches.STATE] == batches.HARD:
+            covered[n_hard] = m
+            n_hard += 1
+    for m in range(n_hard):
+        k, _, pixel = who[covered[m]]
+        ray = _ray_of(view, tile.place[0] + pixel % tile.place[2], tile.place[1] + pixel // tile.place[2])
+        tile = _with_room(tile, MOST_PIECES)
+        _solve_hard(geometry, view, tile, (k, pixel, ray[0], ray[1]), work)
     return tile
 
 
@@ -292,14 +312,16 @@ def fill_tile(
     x_middle, y_middle = 0.5 * (x_first + x_last), 0.5 * (y_first + y_last)
     middle = (x_middle, y_middle, 0.5 * (x_last - x_first), 0.5 * (y_first - y_last))
     window, bounds, who, pixels = (view.start, view.end), geometry.bounds_px, batch.who, batch.pixels
-    least, n, row_of = 0.0, 0, 0
+    highs, t, cover, least_of, hulls = geometry.high, geometry.t, tile.cover, tile.least, geometry.corners_px
+    setup, clip, field = batch.setup, geometry.clip, batch.field
+    least, n, row_of, n_pairs, n_hidden = 0.0, 0, 0, 0, 0
     for m in range(first, last):
         k = prisms[m]
-        high = geometry.high[k]
+        high = highs[k]
         if (m - first) % EVERY == 0:
             least = np.inf
             for pixel in range(width * height):
-                least = min(least, tile.least[pixel])
+                least = min(least, least_of[pixel])
         if high < (1 - CLEARLY) * least:
             break
         first_row = int(max(np.ceil(max(bounds[k, 1], -1.0) - view.y_px), y0))
@@ -308,28 +330,28 @@ def fill_tile(
         most = int(min(np.floor(min(bounds[k, 2], float(view.width)) - view.x_px), x0 + width - 1))
         if low > most or first_row > last_row:
             continue
-        times = (geometry.t[k, 0], geometry.t[k, 1])
+        times = (t[k, 0], t[k, 1])
         is_whole = times[0] <= view.start and times[1] >= view.end
         is_set_up, is_hard, allowed = False, geometry.is_clipped[k], float(geometry.allowed[k])
         for row in range(first_row, last_row + 1):
             left, right = low, most
             if most - low >= WIDE:
-                left, right = _columns(geometry.corners_px, k, row + view.y_px, (low, most), view.x_px)
+                left, right = _columns(hulls, k, row + view.y_px, (low, most), view.x_px)
             count = 0
             for column in range(left - x0, right + 1 - x0):
                 pixel = (row - y0) * width + column
-                cover = tile.least[pixel] if is_whole else _cover_of(tile.cover, pixel, times, window)
-                if high < (1 - CLEARLY) * cover:
-                    tile.counts[2] += 1
+                closed = least_of[pixel] if is_whole else _cover_of(cover, pixel, times, window)
+                if high < (1 - CLEARLY) * closed:
+                    n_hidden += 1
                     continue
                 pixels[count] = column
                 count += 1
             if count == 0:
                 continue
-            tile.counts[1] += count
+            n_pairs += count
             if not (is_set_up or is_hard):
                 is_set_up = True
-                is_hard = not batches.set_up(geometry.clip, k, middle, view.orders_by_w, (batch.setup, row_of))
+                is_hard = not batches.set_up(clip, k, middle, view.orders_by_w, (setup, row_of))
             if is_hard:
                 tile = _with_room(tile, MOST_PIECES * count)
                 for m_pixel in range(count):
@@ -338,17 +360,19 @@ def fill_tile(
                     _solve_hard(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
                 continue
             y = _ray_of(view, x0, row)[1] - y_middle
-            batches.add_row(batch, n, (row_of, allowed, y, count), (x_first - x_middle, 2 / view.width))
+            batches.add_row((setup, field, pixels), n, (row_of, allowed, y, count), (x_first - x_middle, 2 / view.width))
             for m_pixel in range(count):
                 who[n, 0], who[n, 1], who[n, 2] = k, row_of, (row - y0) * width + pixels[m_pixel]
                 n += 1
             if n > batches.ROOM - TILE_PX:
                 tile = _flush(geometry, view, tile, batch, n, work)
                 for c in range(batches.N_SETUP):
-                    batch.setup[0, c] = batch.setup[row_of, c]
+                    setup[0, c] = setup[row_of, c]
                 n, row_of = 0, 0
         if is_set_up and not is_hard:
             row_of = row_of + 1 if n > 0 else 0
+    tile.counts[1] += n_pairs
+    tile.counts[2] += n_hidden
     return _flush(geometry, view, tile, batch, n, work)
 
 

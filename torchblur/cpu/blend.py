@@ -14,9 +14,9 @@ import numpy as np
 from torchblur.cells import MIN_CELL
 from torchblur.cpu.batch import make_batch
 from torchblur.cpu.coverage import make_work
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import borrowed, jit
 from torchblur.cpu.sweep import N_NUMBERS, NO_ROOM, PRISM, Cells, Ray, make_cells, make_ray, make_solver, sweep
-from torchblur.cpu.tiles import TILE_PX, Geometry, View, fill_tile, gather_ray, make_tile
+from torchblur.cpu.tiles import TILE_PX, Geometry, View, count_ray, fill_tile, gather_ray, make_tile
 
 N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
 COMPOSITE, LIST_CELLS, LIST_INTERVALS = 0, 1, 2
@@ -198,9 +198,10 @@ def see_tiles(
 
     Source: ours.
     """
-    which, offsets, prisms = bins
+    geometry, colours, image = borrowed(geometry), borrowed(colours), borrowed(image)
+    which, offsets, prisms = borrowed(bins)
     n_across = (view.width + TILE_PX - 1) // TILE_PX
-    tile, room, solver = make_tile(), (make_batch(), make_work()), make_solver()
+    tile, batch, work, solver = make_tile(), make_batch(), make_work(), make_solver()
     ray, cells = make_ray(64), make_cells(256, 1024)
     counts = np.zeros(len(COUNTS), np.int64)
     listed = _make_listed(FIRST_ROOM if mode != COMPOSITE else 1)
@@ -214,9 +215,12 @@ def see_tiles(
         x0, y0 = which_tile % n_across * TILE_PX, which_tile // n_across * TILE_PX
         width, height = min(TILE_PX, view.width - x0), min(TILE_PX, view.height - y0)
         tile.place[0], tile.place[1], tile.place[2], tile.place[3] = x0, y0, width, height
-        tile = fill_tile(geometry, view, tile, (prisms, offsets[which_tile], offsets[which_tile + 1]), room)
+        tile = fill_tile(geometry, view, tile, (prisms, offsets[which_tile], offsets[which_tile + 1]), (batch, work))
         for pixel in range(width * height):
-            ray, n = gather_ray(geometry, tile, pixel, window, ray)
+            n = count_ray(borrowed(tile), pixel)
+            if n > len(ray.until):
+                ray = make_ray(2 * n)
+            n = gather_ray(geometry, borrowed(tile), pixel, window, borrowed(ray))
             if n == 0:
                 continue
             column, row = x0 + pixel % width, y0 + pixel // width
@@ -224,10 +228,10 @@ def see_tiles(
             counts[4] = max(counts[4], n)
             n_cells, n_crossings = 0, 0
             if mode != LIST_INTERVALS:
-                n_cells, n_crossings = sweep(ray, n, cells, shortest, solver)
+                n_cells, n_crossings = sweep(borrowed(ray), n, borrowed(cells), shortest, borrowed(solver))
                 while n_cells == NO_ROOM:
                     cells = make_cells(2 * len(cells.t), 2 * len(cells.layer))
-                    n_cells, n_crossings = sweep(ray, n, cells, shortest, solver)
+                    n_cells, n_crossings = sweep(borrowed(ray), n, borrowed(cells), shortest, borrowed(solver))
             counts[1] += n_cells
             counts[2] += cells.first[n_cells]
             counts[3] += n_crossings
@@ -240,7 +244,7 @@ def see_tiles(
                 if way > RIGHT:
                     line = view.width - 1 - column
                 delays[0, s] = colours.delay[s] * line
-            _composite(colours, ray, (cells, n_cells), (delays, seen), (image, row, column))
+            _composite(colours, borrowed(ray), (borrowed(cells), n_cells), borrowed((delays, seen)), (image, row, column))
     counts[5], counts[6] = tile.counts[1], tile.counts[2]
     return listed, counts
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import jit
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
 from torchblur.edges import CLIP_NOISE
 
@@ -52,7 +52,7 @@ def make_work() -> Work:
     )
 
 
-@inlined
+@jit
 def _edges(c: np.ndarray, out: np.ndarray) -> None:
     """Write the Bernstein coefficients of the edges of corners `c` (2, 3, 4) to `out` (3, 3)."""
     for edge in range(3):
@@ -65,7 +65,7 @@ def _edges(c: np.ndarray, out: np.ndarray) -> None:
         out[2, edge] = turn * (px * qy - py * qx)
 
 
-@inlined
+@jit
 def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     """Write the local times at which an edge may change sign to `root[:, edge]`; 1 where there is none."""
     i, j = FIRST[edge], SECOND[edge]
@@ -92,7 +92,7 @@ def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     root[0, edge], root[1, edge] = min(first, second), max(first, second)
 
 
-@inlined
+@jit
 def _untied(e: float, slope_x: float, slope_y: float) -> float:
     """Return `e`, or where it is 0 the first of its slopes along the ray's x and y that is not."""
     return e if e != 0 else slope_x if slope_x != 0 else slope_y
@@ -144,7 +144,7 @@ def _still_sign(work: Work) -> int:
     return common
 
 
-@inlined
+@jit
 def _inside_sign(work: Work, u: float) -> int:
     """Return the common sign of the edges at a local time, 0 outside."""
     common = 0

@@ -17,9 +17,9 @@ import numpy as np
 from torchblur.cpu import batch as batches
 from torchblur.cpu.batch import Batch
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import borrowed, jit
 from torchblur.cpu.polynomials import sort_by
-from torchblur.cpu.sweep import DEN, HIGH, IS_OPAQUE, LOW, N_NUMBERS, NUM, PRISM, RANK, T_END, T_START, Ray, make_ray
+from torchblur.cpu.sweep import DEN, HIGH, IS_OPAQUE, LOW, N_NUMBERS, NUM, PRISM, RANK, T_END, T_START, Ray
 from torchblur.hidden import CLEARLY
 from torchblur.intervals import SHORTEST
 from torchblur.pairs import ROUNDING
@@ -244,7 +244,8 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
     n_covered = batches.gather_covered(batch, n)
     batches.restrict(near, n_covered)
     tile = _with_room(tile, n_covered)
-    data, prism, following, first, count = tile.data, tile.prism, tile.next, tile.counts[0], 0
+    own = borrowed(tile)
+    data, prism, following, first, count = own.data, own.prism, own.next, own.counts[0], 0
     for m in range(_U(n_covered)):
         pair = covered[m]
         if near[m + batches.WEAK] != 0:
@@ -257,7 +258,7 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
         data[place, LOW], data[place, HIGH] = near[m + batches.LOW], near[m + batches.HIGH]
         prism[place], following[place] = who[pair, 0], who[pair, 2]
         count += 1
-    _keep(geometry, view, tile, count)
+    _keep(geometry, view, own, count)
     n_hard = 0  # listed first: a loop over all that may call would count references for each
     for m in range(_U(n)):
         if field[m + batches.STATE] == batches.HARD:
@@ -267,7 +268,7 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
         k, _, pixel = who[covered[m]]
         ray = _ray_of(view, tile.place[0] + pixel % tile.place[2], tile.place[1] + pixel // tile.place[2])
         tile = _with_room(tile, MOST_PIECES)
-        _solve_hard(geometry, view, tile, (k, pixel, ray[0], ray[1]), work)
+        _solve_hard(geometry, view, borrowed(tile), (k, pixel, ray[0], ray[1]), work)
     return tile
 
 
@@ -303,16 +304,18 @@ def fill_tile(
 
     Source: ours.
     """
-    batch, work = room
+    batch, work = borrowed(room)
     x0, y0, width, height = tile.place[0], tile.place[1], tile.place[2], tile.place[3]
     prisms, first, last = which
-    _clear(tile)
+    _clear(borrowed(tile))
     x_first, y_first = _ray_of(view, x0, y0)
     x_last, y_last = _ray_of(view, x0 + width - 1, y0 + height - 1)
     x_middle, y_middle = 0.5 * (x_first + x_last), 0.5 * (y_first + y_last)
     middle = (x_middle, y_middle, 0.5 * (x_last - x_first), 0.5 * (y_first - y_last))
     window, bounds, who, pixels = (view.start, view.end), geometry.bounds_px, batch.who, batch.pixels
-    highs, t, cover, least_of, hulls = geometry.high, geometry.t, tile.cover, tile.least, geometry.corners_px
+    own = borrowed(tile)
+    cover, least_of = own.cover, own.least  # not of those that grow
+    highs, t, hulls = geometry.high, geometry.t, geometry.corners_px
     setup, clip, field = batch.setup, geometry.clip, batch.field
     least, n, row_of, n_pairs, n_hidden = 0.0, 0, 0, 0, 0
     for m in range(first, last):
@@ -357,7 +360,7 @@ def fill_tile(
                 for m_pixel in range(count):
                     x_ndc, y_ndc = _ray_of(view, x0 + pixels[m_pixel], row)
                     pixel = (row - y0) * width + pixels[m_pixel]
-                    _solve_hard(geometry, view, tile, (k, pixel, x_ndc, y_ndc), work)
+                    _solve_hard(geometry, view, borrowed(tile), (k, pixel, x_ndc, y_ndc), work)
                 continue
             y = _ray_of(view, x0, row)[1] - y_middle
             batches.add_row((setup, field, pixels), n, (row_of, allowed, y, count), (x_first - x_middle, 2 / view.width))
@@ -377,17 +380,21 @@ def fill_tile(
 
 
 @jit
-def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, float], ray: Ray) -> tuple[Ray, int]:
-    """Return the intervals of a ray that are not hidden in order of their starts, and their number."""
-    following, found, cover, last = tile.next, tile.data, tile.cover, tile.last[pixel]
-    n, i = 0, last
+def count_ray(tile: Tile, pixel: int) -> int:
+    """Return how many intervals of a ray were found."""
+    following = tile.next
+    n, i = 0, tile.last[pixel]
     while i >= 0:
         n += 1
         i = following[i]
-    if n > len(ray.until):
-        ray = make_ray(2 * n)
-    active = ray.active
-    n, i = 0, last
+    return n
+
+
+@jit
+def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, float], ray: Ray) -> int:
+    """Write the intervals of a ray that are not hidden to `ray` in order of their starts, and return their number."""
+    following, found, cover, active = tile.next, tile.data, tile.cover, ray.active
+    n, i = 0, tile.last[pixel]
     while i >= 0:
         if found[i, HIGH] >= (1 - CLEARLY) * _cover_of(cover, pixel, (found[i, T_START], found[i, T_END]), window):
             active[n] = i
@@ -402,4 +409,4 @@ def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, 
         for c in range(N_NUMBERS):
             data[m, c] = found[i, c]
         mark[m, PRISM], mark[m, RANK], mark[m, IS_OPAQUE] = scene_prism[k], rank[k], is_opaque[k]
-    return ray, n
+    return n

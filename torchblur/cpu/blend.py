@@ -28,8 +28,7 @@ COUNTS = ("intervals", "cells", "layers", "crossings", "deepest_pixel", "pairs",
 class Colours(NamedTuple):
     """What constant faces look like, and when it counts."""
 
-    rgb: np.ndarray  # (prisms of the scene, 3)
-    opacity: np.ndarray  # (prisms of the scene,)
+    look: np.ndarray  # (prisms of the scene, 4) straight RGB, opacity
     mesh: np.ndarray  # (prisms of the scene,) int64
     first: np.ndarray  # (S + 1,) int64 first knot of each shutter
     time: np.ndarray  # knots of all shutters
@@ -54,13 +53,13 @@ class Listed(NamedTuple):
 @jit
 def _integral(colours: Colours, s: int, t: float) -> float:
     """Return the weight of shutter `s` before a time of its first line; see `Shutter.weight`. Not yet divided."""
-    total = 0.0
-    for k in range(colours.first[s], colours.first[s + 1] - 1):
-        start, end = colours.time[k], colours.time[k + 1]
+    total, first, time, weight = 0.0, colours.first, colours.time, colours.weight
+    for k in range(first[s], first[s + 1] - 1):
+        start, end = time[k], time[k + 1]
         if t <= start:
             break
-        into, rise = min(t, end) - start, colours.weight[k + 1] - colours.weight[k]
-        total += into * (colours.weight[k] + 0.5 * into * rise / (end - start))
+        into, rise = min(t, end) - start, weight[k + 1] - weight[k]
+        total += into * (weight[k] + (0.5 * into * rise / (end - start) if rise != 0 else 0.0))
     return total
 
 
@@ -77,28 +76,32 @@ def _composite(
     Args:
         colours, ray: what is seen.
         seen_in: cells of the ray, and their number.
-        room: (3, S) delays of the line, areas of the weights, and room; (M,) int64 room.
+        room: (4, S) delays of the line, areas of the weights, and room; (M,) int64 room.
         out: the image, row and column.
     """
     image, row, column = out
     delays, seen = room
     t, first, layer, mark = seen_in[0].t, seen_in[0].first, seen_in[0].layer, ray.mark
-    opacity, rgb, mesh_of, cutoff = colours.opacity, colours.rgb, colours.mesh, colours.cutoff
+    look, mesh_of, cutoff = colours.look, colours.mesh, colours.cutoff
     n_shutters = image.shape[2]
     for k in range(len(seen)):
         seen[k] = 0
+    for s in range(n_shutters):
+        delays[3, s] = 0.0  # of the weight, before the last cell's end
     for k in range(seen_in[1]):
+        is_gap = k == 0 or t[k - 1, 1] != t[k, 0]
         for s in range(n_shutters):
-            start, end = t[k, 0] - delays[0, s], t[k, 1] - delays[0, s]
-            delays[2, s] = (_integral(colours, s, end) - _integral(colours, s, start)) / delays[1, s]
+            before = _integral(colours, s, t[k, 0] - delays[0, s]) if is_gap else delays[3, s]
+            delays[3, s] = _integral(colours, s, t[k, 1] - delays[0, s])
+            delays[2, s] = (delays[3, s] - before) / delays[1, s]
         red, green, blue, left = 0.0, 0.0, 0.0, 1.0
         for m in range(first[k], first[k + 1]):
             prism = mark[layer[m], PRISM]
-            alpha = opacity[prism]
+            alpha = look[prism, 3]
             weight = left * alpha
-            red += weight * rgb[prism, 0]
-            green += weight * rgb[prism, 1]
-            blue += weight * rgb[prism, 2]
+            red += weight * look[prism, 0]
+            green += weight * look[prism, 1]
+            blue += weight * look[prism, 2]
             mesh = mesh_of[prism]
             if alpha > 0 and seen[mesh] != k + 1:
                 seen[mesh] = k + 1
@@ -206,7 +209,7 @@ def see_tiles(
     counts = np.zeros(len(COUNTS), np.int64)
     listed = _make_listed(FIRST_ROOM if mode != COMPOSITE else 1)
     n_shutters = len(colours.delay)
-    delays, seen = np.zeros((3, n_shutters)), np.zeros(max(0, image.shape[3] - N_LOOKS), np.int64)
+    delays, seen = np.zeros((4, n_shutters)), np.zeros(max(0, image.shape[3] - N_LOOKS), np.int64)
     for s in range(n_shutters):
         delays[1, s] = _integral(colours, s, colours.time[colours.first[s + 1] - 1])
     window = (view.start, view.end)

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchblur.bernstein import BISECTIONS, MAX_HALVINGS
+from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.jit import jit
 
 MAX_DEGREE = 6  # of a difference of two nearnesses
-NARROW = 2.0**-50  # bracket of a root
+NARROW = 2.0**-51  # relative: step or bracket that ends the search for a root
+MAX_STEPS = 100  # twice the bits there are
 
 
 @jit
@@ -74,15 +75,46 @@ def signs_of(c: np.ndarray, row: int, n: int, noise: float) -> tuple[int, int, i
 
 
 @jit
-def value_of(c: np.ndarray, row: int, n: int, u: float) -> float:
-    """Return the value at `u` of the polynomial of `n` coefficients in a row of `c`, whose last row is worked in."""
+def _only_root(c: np.ndarray, row: int, n: int, first: int) -> float:
+    """Return the place in [0, 1] at which the polynomial of `n` coefficients in a row of `c` changes sign, which it
+    does once, from `first`. Worked in the last row of `c`.
+
+    With s = u / (1 - u) the polynomial is (1 - u)^(n - 1) times one in s whose coefficients change sign once, too, so
+    that it has one positive root; the half of [0, 1] that holds it is mapped to s in [0, 1]. Newton's steps, inside a
+    bracket.
+    """
     last = len(c) - 1
+    at_half, scale = 0.0, 1.0
     for k in range(n):
-        c[last, k] = c[row, k]
-    for m in range(n - 1, 0, -1):
-        for k in range(m):
-            c[last, k] = (1.0 - u) * c[last, k] + u * c[last, k + 1]
-    return c[last, 0]
+        c[last, k] = scale * c[row, k]
+        at_half += c[last, k]
+        scale = scale * (n - 1 - k) / (k + 1)
+    if at_half == 0:
+        return 0.5
+    is_late = at_half * first > 0
+    if is_late:
+        for k in range(n // 2):
+            c[last, k], c[last, n - 1 - k] = c[last, n - 1 - k], c[last, k]
+    low, high = 0.0, 1.0
+    s = c[last, 0] / (c[last, 0] - at_half) if c[last, 0] * at_half < 0 else 0.5
+    for _ in range(MAX_STEPS):
+        value, slope = c[last, n - 1], 0.0
+        for k in range(n - 2, -1, -1):
+            slope = slope * s + value
+            value = value * s + c[last, k]
+        if value == 0:
+            break
+        if value * at_half < 0:
+            low = s
+        else:
+            high = s
+        step = value / slope
+        if not (low < s - step < high):
+            step = s - 0.5 * (low + high)
+        s -= step
+        if abs(step) <= NARROW * s or not high - low > NARROW * s:
+            break
+    return 1.0 / (1.0 + s) if is_late else s / (1.0 + s)
 
 
 @jit
@@ -104,25 +136,9 @@ def roots_of(room: np.ndarray, n: int, noise: float, found: np.ndarray) -> int:
         if changes == 0:
             continue
         if changes == 1:
-            low, high = 0.0, 1.0
-            at_low, at_high = room[top, 0] * first, room[top, n - 1] * first
-            for step in range(2 * BISECTIONS):
-                middle = (low + high) / 2
-                if step % 3 < 2 and at_low > 0 > at_high:  # false position, and each third time a bisection
-                    middle = min(max(low + (high - low) * (at_low / (at_low - at_high)), low), high)
-                at_middle = value_of(room, top, n, middle) * first
-                if at_middle > 0:
-                    if at_high < 0 and step % 3 == 1:
-                        at_high *= 0.5  # Illinois
-                    low, at_low = middle, at_middle
-                else:
-                    if at_low > 0 and step % 3 == 1:
-                        at_low *= 0.5
-                    high, at_high = middle, at_middle
-                if not (high - low) * width > NARROW:
-                    break
+            root = _only_root(room, top, n, first)
             if count < MAX_DEGREE:
-                found[count] = start + width * (low + high) / 2
+                found[count] = start + width * root
                 count += 1
             continue
         if width <= 2.0**-MAX_HALVINGS:

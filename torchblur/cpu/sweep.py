@@ -34,6 +34,7 @@ class Ray(NamedTuple):
     mark: np.ndarray  # (room, N_MARKS) int64: prism, tie rank of the face, whether it is opaque, and UPPER: with which
     #                   one its order in depth was last certified, -1 for none
     until: np.ndarray  # (room,) time until which this order is certain
+    pace: np.ndarray  # (room,) 1 / length
     by_end: np.ndarray  # (room,) int64
     active: np.ndarray  # (room,) int64 those that cover the ray now, nearest first
 
@@ -57,7 +58,7 @@ class Solver(NamedTuple):
 def make_ray(n: int) -> Ray:
     """Return room for `n` intervals."""
     ints = np.int64
-    return Ray(np.empty((n, N_NUMBERS)), np.empty((n, N_MARKS), ints), np.empty(n), np.empty(n, ints), np.empty(n, ints))
+    return Ray(np.empty((n, N_NUMBERS)), np.empty((n, N_MARKS), ints), np.empty(n), np.empty(n), np.empty(n, ints), np.empty(n, ints))
 
 
 @jit
@@ -73,24 +74,24 @@ def make_solver() -> Solver:
 
 
 @jit
-def _local(data: np.ndarray, i: int, t: float) -> float:
+def _local(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> float:
     """Return where in interval `i` the time `t` lies, in [0, 1]."""
-    start, end = data[i, T_START], data[i, T_END]
-    return min(max((t - start) / (end - start), 0.0), 1.0)
+    return min(max((t - data[i, T_START]) * pace[i], 0.0), 1.0)
 
 
 @jit
-def _nearness(data: np.ndarray, i: int, t: float) -> float:
-    u = _local(data, i, t)
-    den = cubic_at(data[i, DEN], data[i, DEN + 1], data[i, DEN + 2], data[i, DEN + 3], u)
+def _nearness(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> tuple[float, float]:
+    """Return M and D of interval `i` at a time, of which D is not negative."""
+    u = _local(data, pace, i, t)
     num = cubic_at(data[i, NUM], data[i, NUM + 1], data[i, NUM + 2], data[i, NUM + 3], u)
-    return num / den if den != 0 else np.inf
+    den = cubic_at(data[i, DEN], data[i, DEN + 1], data[i, DEN + 2], data[i, DEN + 3], u)
+    return (num, den) if den >= 0 else (-num, -den)
 
 
 @jit
-def _is_in_front(data: np.ndarray, mark: np.ndarray, pair: tuple[int, int], cell: tuple[float, float]) -> bool:
-    """Return whether the first of a pair is in front in the middle of a cell; see `cells._depth_order`."""
-    i, j = pair
+def _is_in_front(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
+    """Return whether interval `i` is in front of `j` in the middle of a cell; see `cells._depth_order`."""
+    data, mark, pace = ray.data, ray.mark, ray.pace
     if data[i, LOW] > data[j, HIGH]:
         return True
     if data[j, LOW] > data[i, HIGH]:
@@ -98,9 +99,13 @@ def _is_in_front(data: np.ndarray, mark: np.ndarray, pair: tuple[int, int], cell
     start, end = cell
     for share in (0.5, 0.75):
         t = share * start + (1 - share) * end
-        a, b = _nearness(data, i, t), _nearness(data, j, t)
-        if a == b == np.inf:
-            break
+        num_i, den_i = _nearness(data, pace, i, t)
+        num_j, den_j = _nearness(data, pace, j, t)
+        if den_i == 0 or den_j == 0:  # edge-on: nearest
+            if den_i == den_j:
+                break
+            return den_i == 0
+        a, b = num_i * den_j, num_j * den_i
         if not abs(a - b) <= TIE * min(abs(a), abs(b)):
             return a > b
     return mark[i, RANK] < mark[j, RANK]
@@ -109,7 +114,7 @@ def _is_in_front(data: np.ndarray, mark: np.ndarray, pair: tuple[int, int], cell
 @jit
 def _order(ray: Ray, n: int, start: float, end: float) -> int:
     """Put the active intervals in order of depth, down to the first opaque one, and return its place, or the last."""
-    data, mark, until, active = ray.data, ray.mark, ray.until, ray.active
+    mark, until, active = ray.mark, ray.until, ray.active
     opaque = -1
     for k in range(n):
         own = active[k]
@@ -118,7 +123,7 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
             front = active[opaque]
             if mark[own, UPPER] == front and until[own] >= end:
                 continue
-            if _is_in_front(data, mark, (front, own), (start, end)):
+            if _is_in_front(ray, front, own, (start, end)):
                 continue
             for m in range(k, opaque + 1, -1):
                 active[m] = active[m - 1]
@@ -128,7 +133,7 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
             above = active[place - 1]
             if mark[own, UPPER] == above and until[own] >= end:
                 break
-            if not _is_in_front(data, mark, (own, above), (start, end)):
+            if not _is_in_front(ray, own, above, (start, end)):
                 break
             active[place], active[place - 1] = above, own
             place -= 1
@@ -140,10 +145,11 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
 
 
 @jit
-def _first_crossing(data: np.ndarray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
+def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
     """Return the first time after `start`, by more than `least`, at which two intervals change places; or the first of
     their ends.
     """
+    data, pace = ray.data, ray.pace
     i, j = pair
     end = min(data[i, T_END], data[j, T_END])
     a0, a1, a2, a3 = data[i, NUM], data[i, NUM + 1], data[i, NUM + 2], data[i, NUM + 3]
@@ -151,11 +157,11 @@ def _first_crossing(data: np.ndarray, pair: tuple[int, int], start: float, least
     p0, p1, p2, p3 = data[j, NUM], data[j, NUM + 1], data[j, NUM + 2], data[j, NUM + 3]
     q0, q1, q2, q3 = data[j, DEN], data[j, DEN + 1], data[j, DEN + 2], data[j, DEN + 3]
     if start > data[i, T_START] or end < data[i, T_END]:
-        u, v = _local(data, i, start), _local(data, i, end)
+        u, v = _local(data, pace, i, start), _local(data, pace, i, end)
         a0, a1, a2, a3 = restrict_cubic(a0, a1, a2, a3, (u, v))
         b0, b1, b2, b3 = restrict_cubic(b0, b1, b2, b3, (u, v))
     if start > data[j, T_START] or end < data[j, T_END]:
-        u, v = _local(data, j, start), _local(data, j, end)
+        u, v = _local(data, pace, j, start), _local(data, pace, j, end)
         p0, p1, p2, p3 = restrict_cubic(p0, p1, p2, p3, (u, v))
         q0, q1, q2, q3 = restrict_cubic(q0, q1, q2, q3, (u, v))
     f0 = a0 * q0 - p0 * b0  # F = a q - p b
@@ -195,9 +201,12 @@ def _certify(ray: Ray, n: int, opaque: int, cell: tuple[float, float, float], so
     data, mark, certain, active = ray.data, ray.mark, ray.until, ray.active
     for k in range(1, n):
         above, own = active[k - 1 if k <= opaque else opaque], active[k]
-        if data[above, LOW] > data[own, HIGH] or (mark[own, UPPER] == above and certain[own] >= end):
+        if mark[own, UPPER] == above and certain[own] >= end:
             continue
-        t = _first_crossing(data, (above, own), start, least, solver)
+        if data[above, LOW] > data[own, HIGH]:
+            mark[own, UPPER], certain[own] = above, min(data[above, T_END], data[own, T_END])
+            continue
+        t = _first_crossing(ray, (above, own), start, least, solver)
         if until - t > least:
             end = min(end, t)
             mark[own, UPPER] = -1
@@ -219,12 +228,12 @@ def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> tu
 
     Source: Ronnow et al. 2021, alg. 1.
     """
-    data, mark, by_end, active = ray.data, ray.mark, ray.by_end, ray.active
+    data, mark, pace, by_end, active = ray.data, ray.mark, ray.pace, ray.by_end, ray.active
     t, first, layer = cells.t, cells.first, cells.layer
     n_cells, n_layers, n_crossings, last = 0, 0, 0, 0
     for k in range(n):
         by_end[k] = k
-        mark[k, UPPER] = -1
+        mark[k, UPPER], pace[k] = -1, 1 / (data[k, T_END] - data[k, T_START])
     sort_by(data, T_END, by_end, n)
     now, next_start, next_end, n_active = data[0, T_START], 0, 0, 0
     while True:

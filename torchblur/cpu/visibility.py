@@ -83,7 +83,8 @@ def prepare(prisms: Prisms, survey: Survey, chosen: Tensor, shutters: tuple[Shut
     times = [(t, w) for s in shutters for t, w in zip(s.times, s.weights, strict=True)]
     first = np.cumsum([0, *(len(s.times) for s in shutters)])
     colours = blend.Colours(
-        *(_array(c[prisms.face_of]) for c in (surfaces.rgb, surfaces.opacity, surfaces.mesh_of)),
+        _array(torch.cat([surfaces.rgb, surfaces.opacity[:, None]], dim=1)[prisms.face_of]),
+        _array(surfaces.mesh_of[prisms.face_of]),
         first,
         *np.array(times).T.copy(),
         np.array([s.line_delay for s in shutters]),

@@ -4,8 +4,8 @@ Before: polynomials.py.  After: tiles.py.
 An edge function of a moving triangle is a quadratic in time whose three coefficients are linear across the screen: a
 prism is set up once for a tile (`set_up`), a pair then costs a few multiplications, and the loops over pairs hold no
 branches and step through memory evenly, so that the compiler turns them into vector instructions. Where a sign is
-within rounding, a root is nearly double or passed slowly, an edge leaves and comes back, or numbers cancel, the pair is marked HARD and
-left to coverage.py.
+within rounding, a root is nearly double or passed slowly, an edge leaves and comes back, or numbers cancel, the pair is
+marked HARD and left to coverage.py.
 Symbols: edge functions e(u) = c + 2 h u + q u u at local time u in [0, 1]; X, Y the ray in NDC from the tile's middle;
 M and D as in intervals.py. All triangles of a tile are set up about one origin, and an edge that two share gets
 opposite numbers, so that no time is lost or counted twice between them.
@@ -72,18 +72,14 @@ def _cross(a: tuple[float, float, float], b: tuple[float, float, float]) -> tupl
 
 
 @jit
-def _corner(
-    clip: np.ndarray, k: int, end: int, c: int, origin: tuple[float, float]
-) -> tuple[float, float, float]:
+def _corner(clip: np.ndarray, k: int, end: int, c: int, origin: tuple[float, float]) -> tuple[float, float, float]:
     """Return x, y, w of a corner of a prism from an origin in NDC."""
     w = clip[k, end, c, W]
     return clip[k, end, c, X] - origin[0] * w, clip[k, end, c, Y] - origin[1] * w, w
 
 
 @jit
-def _product(
-    e: tuple[float, float, float], q: tuple[float, float]
-) -> tuple[float, float, float, float]:
+def _product(e: tuple[float, float, float], q: tuple[float, float]) -> tuple[float, float, float, float]:
     """Return the Bernstein coefficients of a quadratic times a linear function."""
     e0, e1, e2 = e
     a, b = q
@@ -152,10 +148,10 @@ def set_up(
                 sizes = sizes[0] + s[0], sizes[1] + s[1], sizes[2] + s[2], sizes[3] + s[3]
                 for coefficient in range(4):
                     setup[row, D_AT + coefficient] += p[coefficient]
+    least = np.inf
     for n in range(4):
-        if not abs(setup[row, D_AT + n]) >= CANCELS * sizes[n]:
-            return False
-    return True
+        least = min(least, abs(setup[row, D_AT + n]) - CANCELS * sizes[n])
+    return least >= 0
 
 
 @jit
@@ -281,7 +277,7 @@ def restrict(near: np.ndarray, n: int) -> None:
         _, _, d_size = _bounds(d0, d1, d2, d3)
         m0, m1, m2, m3 = restrict_cubic(m0, m1, m2, m3, part)
         d0, d1, d2, d3 = restrict_cubic(d0, d1, d2, d3, part)
-        m_low, m_high, m_most = _bounds(m0, m1, m2, m3)
+        _, _, m_most = _bounds(m0, m1, m2, m3)
         d_low, d_high, _ = _bounds(d0, d1, d2, d3)
         d_least = min(abs(d_low), abs(d_high))
         low, high, _ = _bounds(m0 / d0, m1 / d1, m2 / d2, m3 / d3)

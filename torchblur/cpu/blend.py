@@ -1,6 +1,6 @@
 """What the rays of tiles see: composited at once where colours are constant, else listed for the plain path.
 
-Before: tiles.py.  After: visibility.py.
+Before: fill.py, sweep.py.  After: visibility.py.
 Symbols: S shutters, C channels: N_LOOKS looks and one for each mesh; N intervals, K cells, L layers.
 Source: Ronnow et al. 2021, alg. 1 (resolve).
 """
@@ -14,9 +14,10 @@ import numpy as np
 from torchblur.cells import MIN_CELL
 from torchblur.cpu.batch import make_batch
 from torchblur.cpu.coverage import make_work
+from torchblur.cpu.fill import fill_tile
 from torchblur.cpu.jit import borrowed, jit
 from torchblur.cpu.sweep import N_NUMBERS, NO_ROOM, PRISM, Cells, Ray, make_cells, make_ray, make_solver, sweep
-from torchblur.cpu.tiles import TILE_PX, Geometry, View, count_ray, fill_tile, gather_ray, make_tile
+from torchblur.cpu.tiles import TILE_PX, Geometry, View, count_ray, gather_ray, make_tile
 
 N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
 COMPOSITE, LIST_CELLS, LIST_INTERVALS = 0, 1, 2
@@ -247,7 +248,9 @@ def see_tiles(
                 if way > RIGHT:
                     line = view.width - 1 - column
                 delays[0, s] = colours.delay[s] * line
-            _composite(colours, borrowed(ray), (borrowed(cells), n_cells), borrowed((delays, seen)), (image, row, column))
+            _composite(
+                colours, borrowed(ray), (borrowed(cells), n_cells), borrowed((delays, seen)), (image, row, column)
+            )
     counts[5], counts[6] = tile.counts[1], tile.counts[2]
     return listed, counts
 

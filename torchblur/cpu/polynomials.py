@@ -10,14 +10,14 @@ from __future__ import annotations
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 
 MAX_DEGREE = 6  # of a difference of two nearnesses
 NARROW = 2.0**-51  # relative: step or bracket that ends the search for a root
 MAX_STEPS = 100  # twice the bits there are
 
 
-@jit
+@inlined
 def cubic_at(c0: float, c1: float, c2: float, c3: float, u: float) -> float:
     """Return the value at `u` of the cubic of four coefficients."""
     v = 1.0 - u
@@ -26,7 +26,7 @@ def cubic_at(c0: float, c1: float, c2: float, c3: float, u: float) -> float:
     return v * a + u * b
 
 
-@jit
+@inlined
 def restrict_cubic(
     c0: float, c1: float, c2: float, c3: float, part: tuple[float, float]
 ) -> tuple[float, float, float, float]:
@@ -58,7 +58,7 @@ def sort_by(key: np.ndarray, column: int, order: np.ndarray, n: int) -> None:
         gap //= 3
 
 
-@jit
+@inlined
 def signs_of(c: np.ndarray, row: int, n: int, noise: float) -> tuple[int, int, int]:
     """Return how often the sign changes along `n` coefficients, and the first and the last sign; noise counts as 0."""
     changes, first, last = 0, 0, 0

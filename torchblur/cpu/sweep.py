@@ -18,7 +18,7 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cells import CROSSING_NOISE
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of, sort_by
 from torchblur.sort import TIE
 
@@ -58,7 +58,14 @@ class Solver(NamedTuple):
 def make_ray(n: int) -> Ray:
     """Return room for `n` intervals."""
     ints = np.int64
-    return Ray(np.empty((n, N_NUMBERS)), np.empty((n, N_MARKS), ints), np.empty(n), np.empty(n), np.empty(n, ints), np.empty(n, ints))
+    return Ray(
+        np.empty((n, N_NUMBERS)),
+        np.empty((n, N_MARKS), ints),
+        np.empty(n),
+        np.empty(n),
+        np.empty(n, ints),
+        np.empty(n, ints),
+    )
 
 
 @jit
@@ -73,13 +80,13 @@ def make_solver() -> Solver:
     return Solver(np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
 
 
-@jit
+@inlined
 def _local(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> float:
     """Return where in interval `i` the time `t` lies, in [0, 1]."""
     return min(max((t - data[i, T_START]) * pace[i], 0.0), 1.0)
 
 
-@jit
+@inlined
 def _nearness(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> tuple[float, float]:
     """Return M and D of interval `i` at a time, of which D is not negative."""
     u = _local(data, pace, i, t)
@@ -90,12 +97,8 @@ def _nearness(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> tuple[flo
 
 @jit
 def _is_in_front(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
-    """Return whether interval `i` is in front of `j` in the middle of a cell; see `cells._depth_order`."""
+    """Return whether interval `i` is in front of `j` in the middle of a cell, by a close look."""
     data, mark, pace = ray.data, ray.mark, ray.pace
-    if data[i, LOW] > data[j, HIGH]:
-        return True
-    if data[j, LOW] > data[i, HIGH]:
-        return False
     start, end = cell
     for share in (0.5, 0.75):
         t = share * start + (1 - share) * end
@@ -111,7 +114,17 @@ def _is_in_front(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
     return mark[i, RANK] < mark[j, RANK]
 
 
-@jit
+@inlined
+def _precedes(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
+    """Return whether interval `i` is in front of `j` in the middle of a cell; see `cells._depth_order`."""
+    if ray.data[i, LOW] > ray.data[j, HIGH]:
+        return True
+    if ray.data[j, LOW] > ray.data[i, HIGH]:
+        return False
+    return _is_in_front(ray, i, j, cell)
+
+
+@inlined
 def _order(ray: Ray, n: int, start: float, end: float) -> int:
     """Put the active intervals in order of depth, down to the first opaque one, and return its place, or the last."""
     mark, until, active = ray.mark, ray.until, ray.active
@@ -123,7 +136,7 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
             front = active[opaque]
             if mark[own, UPPER] == front and until[own] >= end:
                 continue
-            if _is_in_front(ray, front, own, (start, end)):
+            if _precedes(ray, front, own, (start, end)):
                 continue
             for m in range(k, opaque + 1, -1):
                 active[m] = active[m - 1]
@@ -133,7 +146,7 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
             above = active[place - 1]
             if mark[own, UPPER] == above and until[own] >= end:
                 break
-            if not _is_in_front(ray, own, above, (start, end)):
+            if not _precedes(ray, own, above, (start, end)):
                 break
             active[place], active[place - 1] = above, own
             place -= 1
@@ -144,7 +157,7 @@ def _order(ray: Ray, n: int, start: float, end: float) -> int:
     return opaque if opaque >= 0 else n - 1
 
 
-@jit
+@inlined
 def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float, solver: Solver) -> float:
     """Return the first time after `start`, by more than `least`, at which two intervals change places; or the first of
     their ends.
@@ -186,12 +199,12 @@ def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float,
     return first
 
 
-@jit
+@inlined
 def _largest(a: float, b: float, c: float, d: float) -> float:
     return max(max(abs(a), abs(b)), max(abs(c), abs(d)))
 
 
-@jit
+@inlined
 def _certify(ray: Ray, n: int, opaque: int, cell: tuple[float, float, float], solver: Solver) -> float:
     """Return the time within a cell (start, end, shortest) until which the order of the active intervals holds."""
     start, end, least = cell

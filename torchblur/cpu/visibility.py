@@ -28,7 +28,7 @@ from torchblur.scene import Scene
 from torchblur.shutter import DIRECTIONS, Shutter
 from torchblur.survey import Survey
 
-JOBS_A_THREAD = 8  # portions of the tiles, so that threads end together
+JOBS_A_THREAD = 4  # portions of the tiles, so that threads end together
 BYTES_PER_LOAD = 150  # of what is listed, a pair of prism and pixel
 
 
@@ -105,7 +105,7 @@ def composite(sight: Sight, scene: Scene, ray: Ray, may_cross: bool) -> tuple[Te
     def see(tiles: np.ndarray) -> np.ndarray:
         return blend.see_tiles(sight.geometry, view, (tiles, offsets, prisms), sight.colours, image, blend.COMPOSITE)[1]
 
-    counts = on_threads(see, _shares(load, JOBS_A_THREAD * torch.get_num_threads()))
+    counts = on_threads(see, _shares(load, _n_jobs()))
     return torch.from_numpy(image).movedim(2, 0), _total(counts)
 
 
@@ -153,11 +153,18 @@ def _view(sight: Sight, scene: Scene, ray: Ray, may_cross: bool) -> View:
     return View(*place, float(start), float(end), prisms.orders_by_w, may_cross)
 
 
+def _n_jobs() -> int:
+    threads = torch.get_num_threads()
+    return threads if threads == 1 else JOBS_A_THREAD * threads
+
+
 def _shares(load: np.ndarray, n: int, tiles: np.ndarray | None = None) -> list[np.ndarray]:
-    """Return the tiles that have any `load` dealt into at most `n` shares, each with about as much to do."""
+    """Return the tiles that have any `load` dealt into at most `n` shares, each with about as much to do, row by row as
+    neighbours look at the same prisms.
+    """
     tiles = np.flatnonzero(load) if tiles is None else tiles
     tiles = tiles[np.argsort(-load[tiles], kind="stable")]
-    return [tiles[k::n] for k in range(min(n, len(tiles)))]
+    return [np.sort(tiles[k::n]) for k in range(min(n, len(tiles)))]
 
 
 def _total(counts: list[np.ndarray]) -> dict[str, int]:

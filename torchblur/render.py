@@ -51,7 +51,7 @@ def render(  # noqa: PLR0913  all keywords but the first
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
-    backend: str = "torch",
+    backend: str = "auto",
 ) -> Frame:
     """Return the mean of `scene` over its exposure, weighted by the shutter, exact in time, without samples or noise.
 
@@ -102,7 +102,7 @@ def render_windows(  # noqa: PLR0913  as render, and the windows
     shutter: Shutter | None = None,
     rays_per_pixel: int = 1,
     memory_bytes: int = 1 << 28,
-    backend: str = "torch",
+    backend: str = "auto",
 ) -> tuple[Frame, ...]:
     """Return a frame for each part of the exposure, all from one set of intervals, which is found only once.
 

@@ -1,124 +1,189 @@
-"""Time and memory of the torch path, and what averaging sharp images costs for the same accuracy, in one run.
+"""Time and memory of exact frames at the papers' sizes, beside plain torch and means of sharp images, in one run.
 
-    python scripts/benchmark.py [--size 512] [--threads 2]
+    python scripts/benchmark.py [--threads 2] [--scenes character cloth] [--curves] [--out results.json]
 
-Prints Markdown tables. Ratios of one run on one machine are worth quoting; seconds are for orientation.
+Each scene is rendered in a process of its own, after a first call that compiles. Prints Markdown tables; ratios of one
+run on one machine are worth quoting, seconds are for orientation. `--curves` adds how time grows with triangles,
+pixels, length of motion, depth of glass and threads, with the slope in log-log, and `--plot` draws it.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
+import os
 import platform
 import resource
 import subprocess
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import torch
-import trimesh
+from benchmark_scenes import CASES, CURVES
 
 import torchblur as tb
 
 AVERAGES = (8, 32, 128)
-BUDGETS_MB = (64, 256, 1024)
+REPEATS = 5
+MOST_PIXELS_IN_TORCH = 1920 * 1080
 
 
-def sphere(size: int, opacity: float) -> tb.Scene:
-    """Return a ball of 5,000 triangles that fills the view and moves by about 20 px at 512 px."""
-    ball = trimesh.creation.uv_sphere(radius=1.9, count=[36, 36])
-    start = torch.tensor(ball.vertices, dtype=torch.float32)
-    color = torch.rand(len(ball.faces), 3, generator=torch.Generator().manual_seed(0))
-    mesh = tb.Mesh(
-        torch.stack([start, start + torch.tensor([0.15, 0.05, 0.0])]), ball.faces, tb.Material(color, opacity)
-    )
-    camera = tb.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y_deg=45, width=size, height=size, near=0.5, far=20)
-    return tb.Scene([mesh], camera, background=(0.2, 0.3, 0.4))
+def best(function: Callable[[], Any], repeats: int = REPEATS) -> tuple[float, Any]:
+    """Return the least wall time of some calls [s], and the last result."""
+    times, result = [], None
+    for _ in range(repeats):
+        start = time.perf_counter()
+        result = function()
+        times.append(time.perf_counter() - start)
+    return min(times), result
 
 
-def rotor(size: int) -> tb.Scene:
-    """Return four blades that turn by 60 degrees in 16 linear pieces, over a still floor."""
-    blade = trimesh.creation.box(extents=(3.6, 0.35, 0.05))
-    cross = trimesh.creation.box(extents=(0.35, 3.6, 0.05))
-    poses = [trimesh.transformations.rotation_matrix(math.radians(60) * k / 16, (0.1, 0.3, 1.0)) for k in range(17)]
-    meshes = []
-    for solid, color in ((blade, (0.9, 0.5, 0.1)), (cross, (0.2, 0.6, 0.9))):
-        knots = [torch.tensor(trimesh.transform_points(solid.vertices, p), dtype=torch.float32) for p in poses]
-        meshes.append(tb.Mesh(torch.stack(knots), solid.faces, tb.Material(color)))
-    floor = trimesh.creation.box(extents=(8, 8, 0.1)).subdivide().subdivide()
-    below = torch.tensor(floor.vertices, dtype=torch.float32) - torch.tensor([0.0, 0.0, 1.0])
-    shade = torch.rand(len(floor.faces), 3, generator=torch.Generator().manual_seed(1))
-    meshes.append(tb.Mesh(below, floor.faces, tb.Material(shade)))
-    camera = tb.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y_deg=45, width=size, height=size, near=0.5, far=20)
-    return tb.Scene(meshes, camera)
-
-
-def shards(size: int) -> tb.Scene:
-    """Return 200 half-transparent triangles in random motion."""
-    generator = torch.Generator().manual_seed(2)
-    place = torch.rand(200, 1, 3, generator=generator) * 3 - 1.5
-    shape = torch.rand(200, 3, 3, generator=generator) - 0.5
-    motion = torch.rand(200, 1, 3, generator=generator) * 0.6 - 0.3
-    start = (place + shape).reshape(-1, 3)
-    end = (place + shape * 1.1 + motion).reshape(-1, 3)
-    material = tb.Material(torch.rand(200, 3, generator=generator), 0.5)
-    camera = tb.Camera.look_at((0, 0, 5), (0, 0, 0), fov_y_deg=45, width=size, height=size, near=0.5, far=20)
-    return tb.Scene([tb.Mesh(torch.stack([start, end]), torch.arange(600).reshape(200, 3), material)], camera)
-
-
-def seconds(function) -> tuple[float, object]:
-    """Return the wall time of `function` and its result."""
-    start = time.perf_counter()
-    result = function()
-    return time.perf_counter() - start, result
-
-
-def compare(name: str, scene: tb.Scene) -> str:
-    """Return a table row: the exact frame, and averages of N sharp images beside it."""
-    exact_s, frame = seconds(lambda: tb.render(scene, backend="torch"))
-    cells = []
+def measure(name: str) -> dict[str, Any]:
+    """Return what a scene takes, in this process."""
+    case = CASES[name]
+    scene = case.make(case.width, case.height)
+    before_mb = _peak_mb()
+    first_s, _ = best(lambda: tb.render(scene, backend="cpu"), 1)
+    exact_s, frame = best(lambda: tb.render(scene, backend="cpu"))
+    peak_mb = _peak_mb()
+    counts = {k: frame.counts[k] for k in ("prisms", "pairs", "intervals", "deepest_pixel", "cells")}
+    found: dict[str, Any] = {
+        "scene": name,
+        "size_px": [case.width, case.height],
+        "triangles": sum(m.n_faces for m in scene.meshes),
+        **counts,
+        "exact_s": exact_s,
+        "first_s": first_s,
+        "stages_s": frame.timings,
+        "ns_per_interval": 1e9 * exact_s / max(1, frame.counts["intervals"]),
+        "peak_mb": peak_mb,
+        "before_mb": before_mb,
+        "means": {},
+    }
     for n in AVERAGES:
-        average_s, average = seconds(lambda n=n: tb.accumulate(scene, n, backend="torch"))
-        rmse = float((average.rgba - frame.rgba).double().square().mean().sqrt())
-        cells.append(f"{average_s / exact_s:.1f}x, {-20 * math.log10(max(rmse, 1e-12)):.0f} dB")
-    counts = f"{frame.counts['prisms']:,} prisms, {frame.counts['intervals']:,} intervals"
-    return f"| {name} ({counts}) | {exact_s:.2f} s | " + " | ".join(cells) + " |"
+        tb.accumulate(scene, 1, backend="cpu")
+        mean_s, mean = best(lambda n=n: tb.accumulate(scene, n, backend="cpu"), 1)
+        rmse = float((mean.rgba - frame.rgba).double().square().mean().sqrt())
+        found["means"][n] = {"ratio": mean_s / exact_s, "psnr_db": -20 * math.log10(max(rmse, 1e-12))}
+    if case.width * case.height <= MOST_PIXELS_IN_TORCH:
+        plain_s, plain = best(lambda: tb.render(scene, backend="torch"), 1)
+        found |= {"torch_ratio": plain_s / exact_s, "largest_gap": float((plain.rgba - frame.rgba).abs().max())}
+    return found
 
 
-def memory_row(size: int, budget_mb: int) -> str:
-    """Return a table row with the peak memory and time of the ball in a fresh process."""
-    options = {"--size": size, "--threads": torch.get_num_threads(), "--budget-mb": budget_mb}
-    command = [sys.executable, __file__, *(str(x) for pair in options.items() for x in pair)]
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+def measure_curve(name: str, threads: int) -> dict[str, Any]:
+    """Return how time grows along one curve."""
+    rows = []
+    for value in CURVES[name][0]:
+        scene = CURVES[name][1](value)
+        tb.render(scene, backend="cpu")
+        seconds, frame = best(lambda scene=scene: tb.render(scene, backend="cpu"), 3)
+        triangles, pixels = sum(m.n_faces for m in scene.meshes), scene.camera.width * scene.camera.height
+        rows.append({"value": value, "s": seconds, "triangles": triangles, "pixels": pixels, **_whole(frame.counts)})
+    by = {"triangles": "triangles", "pixels": "pixels"}.get(name, "intervals")
+    return {"curve": name, "by": by, "threads": threads, "rows": rows, "slope": _slope([(r[by], r["s"]) for r in rows])}
+
+
+def _whole(counts: dict[str, int]) -> dict[str, int]:
+    return {k: counts[k] for k in ("prisms", "intervals", "cells", "layers", "deepest_pixel")}
+
+
+def _slope(points: list[tuple[float, float]]) -> float:
+    """Return the slope of the line through points in log-log that is nearest in the mean square."""
+    x, y = (torch.tensor(v, dtype=torch.float64).log() for v in zip(*points, strict=True))
+    x = x - x.mean()
+    return float((x * y).sum() / (x * x).sum())
+
+
+def _peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def in_own_process(kind: str, name: str, threads: int) -> dict[str, Any]:
+    """Return what one scene or curve takes, measured in a process of its own."""
+    command = [sys.executable, __file__, f"--only-{kind}", name, "--threads", str(threads)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise RuntimeError(f"{name}: {done.stderr.strip()[-2000:]}")
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def row(found: dict[str, Any]) -> str:
+    """Return a row of the table of scenes."""
+    means = [f"{found['means'][str(n)]['ratio']:.2f}x, {found['means'][str(n)]['psnr_db']:.0f} dB" for n in AVERAGES]
+    width, height = found["size_px"]
+    plain = f"{found['torch_ratio']:.0f}x" if "torch_ratio" in found else "not run"
+    cells = [
+        f"{found['scene']}, {width} x {height}",
+        f"{found['triangles']:,}",
+        f"{found['intervals']:,}",
+        f"{found['deepest_pixel']}",
+        f"{1e3 * found['exact_s']:.0f} ms",
+        f"{found['ns_per_interval']:.0f} ns",
+        plain,
+        *means,
+        f"{found['peak_mb'] - found['before_mb']:.0f} MB",
+    ]
+    return "| " + " | ".join(cells) + " |"
+
+
+def plot(curves: list[dict[str, Any]], path: Path) -> None:
+    """Draw the curves."""
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(curves), figsize=(4 * len(curves), 3.2), squeeze=False)
+    for axis, curve in zip(axes[0], curves, strict=True):
+        x, y = [r[curve["by"]] for r in curve["rows"]], [r["s"] for r in curve["rows"]]
+        axis.loglog(x, y, marker="o")
+        axis.set(xlabel=curve["by"], ylabel="s", title=f"{curve['curve']}: slope {curve['slope']:.2f}")
+    figure.tight_layout()
+    figure.savefig(path)
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--size", type=int, default=512, help="width and height [px]")
-    parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="torch threads")
-    parser.add_argument("--budget-mb", type=int, help="only measure the memory of the ball under this budget")
+    parser.add_argument("--threads", type=int, default=os.cpu_count(), help="torch threads")
+    parser.add_argument("--scenes", nargs="*", choices=list(CASES), default=list(CASES), help="all by default")
+    parser.add_argument("--curves", action="store_true", help="measure how time grows, too")
+    parser.add_argument("--out", type=Path, help="JSON file to write all figures to")
+    parser.add_argument("--plot", type=Path, help="picture of the curves to write")
+    parser.add_argument("--only-scene", choices=list(CASES), help=argparse.SUPPRESS)
+    parser.add_argument("--only-curve", choices=list(CURVES), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
-    if arguments.budget_mb:
-        wall, frame = seconds(lambda: tb.render(sphere(arguments.size, 1.0), memory_bytes=arguments.budget_mb << 20))
-        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-        print(f"| {arguments.budget_mb} MB | {peak:.0f} MB | {wall:.1f} s | {frame.counts['blocks']} |")
+    if arguments.only_scene:
+        print(json.dumps(measure(arguments.only_scene)))
         return
-    where = f"{platform.machine()}, {arguments.threads} threads, torch {torch.__version__}"
-    print(f"{arguments.size} x {arguments.size} px, float32, {where}\n")
-    print("| scene | exact | " + " | ".join(f"mean of {n}" for n in AVERAGES) + " |")
-    print("|---|--:|" + "--:|" * len(AVERAGES))
-    for name, scene in (
-        ("opaque ball", sphere(arguments.size, 1.0)),
-        ("half-transparent ball", sphere(arguments.size, 0.5)),
-        ("rotor, 16 pieces", rotor(arguments.size)),
-        ("half-transparent shards", shards(arguments.size // 2)),
-    ):
-        print(compare(name, scene), flush=True)
-    print("\n| memory budget | peak of the whole process | time | blocks |\n|--:|--:|--:|--:|")
-    for budget in BUDGETS_MB:
-        print(memory_row(arguments.size, budget), flush=True)
+    if arguments.only_curve:
+        print(json.dumps(measure_curve(arguments.only_curve, arguments.threads)))
+        return
+    print(f"float32, {platform.machine()}, {arguments.threads} threads, torch {torch.__version__}\n")
+    head = ["scene", "triangles", "intervals", "deepest", "exact", "an interval", "plain torch"]
+    head += [*(f"mean of {n}" for n in AVERAGES), "memory"]
+    print("| " + " | ".join(head) + " |\n|---|" + "--:|" * (len(head) - 1), flush=True)
+    scenes, curves = [], []
+    for name in arguments.scenes:
+        scenes.append(in_own_process("scene", name, arguments.threads))
+        print(row(scenes[-1]), flush=True)
+    if arguments.curves or arguments.plot:
+        print("\n| grows | threads | from | to | slope in log-log |\n|---|--:|--:|--:|--:|")
+        for name in CURVES:
+            for threads in sorted({1, arguments.threads}):
+                curve = in_own_process("curve", name, threads)
+                curves.append(curve)
+                ends = [f"{1e3 * curve['rows'][k]['s']:.1f} ms at {curve['rows'][k][curve['by']]:,}" for k in (0, -1)]
+                print(
+                    f"| {curve['by']} ({name}) | {threads} | {ends[0]} | {ends[1]} | {curve['slope']:.2f} |", flush=True
+                )
+    if arguments.out:
+        arguments.out.write_text(json.dumps({"scenes": scenes, "curves": curves}, indent=1))
+    if arguments.plot:
+        plot([c for c in curves if c["threads"] == arguments.threads], arguments.plot)
 
 
 if __name__ == "__main__":

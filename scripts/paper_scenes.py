@@ -176,7 +176,7 @@ def _chip(n: int, radius: float, half_height: float) -> Shape:
     return vertices, torch.cat([top, top.flip(1) + n, rim]), uv
 
 
-def _capsule(length: float, radii: tuple[float, float], flat: float, n_around: int = 16, n_along: int = 6) -> Shape:
+def capsule(length: float, radii: tuple[float, float], flat: float, n_around: int = 16, n_along: int = 6) -> Shape:
     """Return a closed limb along y from 0 to `length`, round at both ends, `flat` times as wide along z as along x."""
     quarter = torch.linspace(0, math.pi / 2, n_along + 1, dtype=torch.float64)
     body = torch.linspace(0, 1, n_along + 3, dtype=torch.float64)[1:-1]
@@ -238,11 +238,13 @@ def pose(share: float, hip: tuple[float, float]) -> Pose:
     return poses
 
 
-def figure(size: int, poses: Sequence[Pose]) -> list[tb.Mesh]:
-    """Return the figure's limbs, moving linearly between poses at equally spaced times."""
+def figure(size: int, poses: Sequence[Pose], detail: tuple[int, int] = (16, 6)) -> list[tb.Mesh]:
+    """Return the figure's limbs, moving linearly between poses at equally spaced times; `detail` counts the triangles
+    around a limb and along its round ends: 14 x 2 around (3 along + 1) in all.
+    """
     meshes = []
     for k, (name, *_, length, radii, flat, (colour, other, across, along)) in enumerate(LIMBS):
-        vertices, faces, uv = _capsule(length, radii, flat)
+        vertices, faces, uv = capsule(length, radii, flat, *detail)
         motion = torch.stack([vertices @ turn.T + base for base, turn in (p[name] for p in poses)])
         look = textured(_cloth(max(8, size // 6), (colour, other), (across, along), seed=k))
         meshes.append(tb.Mesh(motion, faces, look, name=name, uv=uv))

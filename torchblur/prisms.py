@@ -75,8 +75,7 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
 
     Source: Ronnow et al. 2021, sec. 3; segments ours.
     """
-    camera = scene.camera
-    parts: list[tuple[Tensor, ...]] = [_no_prisms(scene.device)]
+    pieces: dict[tuple[float, float], list[tuple[Tensor, ...]]] = {}  # of all meshes, by slice of time
     for i, mesh in enumerate(scene.meshes):
         if mesh.n_faces == 0:
             continue
@@ -93,8 +92,12 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
             clip_open = clip_vertices[k, corners].permute(1, 2, 0)  # (3, 4, F)
             clip_close = clip_open if is_static else clip_vertices[k + 1, corners].permute(1, 2, 0)
             moving = [a[k : k + 2, corners].permute(0, 2, 3, 1) for a in attributes]  # (2, 3, 3, F)
-            ends = torch.stack([clip_open, clip_close])
-            parts.append(_seen(scene, (ends, *moving), (times[k], times[k + 1]), face))
+            piece = (torch.stack([clip_open, clip_close]), *moving, face)
+            pieces.setdefault((times[k], times[k + 1]), []).append(piece)
+    parts = [_no_prisms(scene.device)]
+    for times, own in pieces.items():
+        *corners, face = (torch.cat(p, dim=-1) for p in zip(*own, strict=True))
+        parts.append(_seen(scene, tuple(corners), times, face))
     clip, t_open, t_close, face_of, corner_of, parity, is_clipped, bounds, world, normal, corners_px = (
         torch.cat(p, dim=-1) for p in zip(*parts, strict=True)
     )
@@ -111,7 +114,7 @@ def build_prisms(scene: Scene, surfaces: Surfaces, window: tuple[float, float]) 
         normal=normal,
         corners_px=corners_px,
         surfaces=surfaces,
-        orders_by_w=camera.orders_by_w,
+        orders_by_w=scene.camera.orders_by_w,
         window=window,
     )
 

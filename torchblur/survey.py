@@ -117,6 +117,12 @@ def _may_cross(prisms: Prisms, nearness: Tensor, moves: Tensor, size_px: tuple[i
     is_lively[place[moves[of]]] = True
     lively = is_lively[place].nonzero().flatten()
     place, of = place[lively], of[lively]
+    # most scenes that may cross show it by any one prism of each place, which saves the sorts
+    one = torch.zeros_like(is_lively, dtype=torch.int64).index_put_((place,), of)[place]
+    (least, greatest), (other_least, other_greatest) = nearness[:, of], nearness[:, one]
+    reach = torch.where(least <= other_least, greatest, other_greatest)
+    if bool(((one != of) & (torch.maximum(least, other_least) * (1 + TOUCHING) < reach)).any()):
+        return True
     order = torch.sort(nearness[0, of], stable=True).indices
     order = order[torch.sort(place[order], stable=True).indices]
     place, (least, greatest) = place[order], nearness[:, of[order]]

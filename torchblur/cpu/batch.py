@@ -1,10 +1,10 @@
 """Solve many pairs of a prism and a ray of one tile at once, where rounding cannot change what is found.
 
-Before: polynomials.py.  After: tiles.py.
+Before: polynomials.py.  After: fill.py.
 An edge function of a moving triangle is a quadratic in time whose three coefficients are linear across the screen: a
 prism is set up once for a tile (`set_up`), a pair then costs a few multiplications, and the loops over pairs hold no
 branches and step through memory evenly, so that the compiler turns them into vector instructions. Where a sign is
-within rounding, a root is nearly double or passed slowly, an edge leaves and comes back, or numbers cancel, the pair is
+within rounding, a root is nearly double or passed slowly, there is more than one piece, or numbers cancel, the pair is
 marked HARD and left to coverage.py.
 Symbols: edge functions e(u) = c + 2 h u + q u u at local time u in [0, 1]; X, Y the ray in NDC from the tile's middle;
 M and D as in intervals.py. All triangles of a tile are set up about one origin, and an edge that two share gets
@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import restrict_cubic
 
 ROOM = 256  # pairs of a batch
@@ -28,17 +28,17 @@ X, Y, W, Z = 0, 1, 2, 3
 HARD, ONE_PIECE = 2.0, 1.0  # states of a pair; 0 where nothing is covered
 UNSURE = 1e-12  # of the largest product: an edge function this small may have either sign
 SLOW = 4e6  # times as much: an edge function that passes zero by half this slope does so at an unsure time (1e-10)
-CANCELS = 1e-3  # of the sum of the sizes: a sum this small
+CANCELS = 1e-3  # of the greatest sum of sizes: a result this small has lost as many digits
 
-# columns of `Batch.setup`: K, KX, KY of c, h, q of each edge; M0, MX, MY of each coefficient; D; where M0 holds; noise
-M_AT, D_AT, AT_X, AT_Y, NOISE_AT, N_SETUP = 27, 39, 43, 44, 45, 46
+# columns of `Batch.setup`: K, KX, KY of c, h, q of each edge; M0, MX, MY of each coefficient; D; where M0 holds; noise; size of D's sums
+M_AT, D_AT, AT_X, AT_Y, NOISE_AT, SIZE_AT, N_SETUP = 27, 39, 43, 44, 45, 46, 47
 
 # Fields of the flat arrays, ROOM numbers each, one of a pair. They are unsigned, as else each access asks for a sign.
 _U = np.uint64
 C0, H0, Q0, C1, H1, Q1, C2, H2, Q2 = (_U(k * ROOM) for k in range(9))
 NOISE, ALLOWED, START, END, STATE, PAIR_X, PAIR_Y = (_U(k * ROOM) for k in range(9, 16))
 N_FIELDS = 16
-M0, M1, M2, M3, D0, D1, D2, D3, FROM, TO, LOW, HIGH, WEAK = (_U(k * ROOM) for k in range(13))
+M0, M1, M2, M3, D0, D1, D2, D3, FROM, TO, LOW, HIGH, WEAK, SIZE = (_U(k * ROOM) for k in range(14))
 
 
 class Batch(NamedTuple):
@@ -65,20 +65,20 @@ def make_batch() -> Batch:
     )
 
 
-@jit
+@inlined
 def _cross(a: tuple[float, float, float], b: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return K, KX, KY, for which the edge from `a` to `b`, (x, y, w) each, is K + KX X + KY Y."""
     return a[0] * b[1] - a[1] * b[0], a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2]
 
 
-@jit
+@inlined
 def _corner(clip: np.ndarray, k: int, end: int, c: int, origin: tuple[float, float]) -> tuple[float, float, float]:
     """Return x, y, w of a corner of a prism from an origin in NDC."""
     w = clip[k, end, c, W]
     return clip[k, end, c, X] - origin[0] * w, clip[k, end, c, Y] - origin[1] * w, w
 
 
-@jit
+@inlined
 def _product(e: tuple[float, float, float], q: tuple[float, float]) -> tuple[float, float, float, float]:
     """Return the Bernstein coefficients of a quadratic times a linear function."""
     e0, e1, e2 = e
@@ -89,8 +89,8 @@ def _product(e: tuple[float, float, float], q: tuple[float, float]) -> tuple[flo
 @jit
 def set_up(
     clip: np.ndarray, k: int, tile: tuple[float, float, float, float], orders_by_w: bool, out: tuple[np.ndarray, int]
-) -> bool:
-    """Write what a tile needs of a prism to a row of `Batch.setup`; return whether its pairs can be solved in batches.
+) -> None:
+    """Write what a tile needs of a prism to a row of `Batch.setup`.
 
     Args:
         clip: (P, 2, 3, 4) x y w z of the prisms, all in front of the camera.
@@ -148,10 +148,7 @@ def set_up(
                 sizes = sizes[0] + s[0], sizes[1] + s[1], sizes[2] + s[2], sizes[3] + s[3]
                 for coefficient in range(4):
                     setup[row, D_AT + coefficient] += p[coefficient]
-    least = np.inf
-    for n in range(4):
-        least = min(least, abs(setup[row, D_AT + n]) - CANCELS * sizes[n])
-    return least >= 0
+    setup[row, SIZE_AT] = max(max(sizes[0], sizes[1]), max(sizes[2], sizes[3]))
 
 
 @jit
@@ -185,7 +182,7 @@ def add_row(
             field[first + m] = constant + slope * field[base + m + PAIR_X]
 
 
-@jit
+@inlined
 def _edge(c: float, h: float, q: float, noise: float) -> tuple[float, float, bool, bool, bool]:
     """Return the earlier and the later root in (0, 1), 1 where there is none; whether the edge is surely positive,
     surely negative, or unsure.
@@ -204,35 +201,60 @@ def _edge(c: float, h: float, q: float, noise: float) -> tuple[float, float, boo
     return min(first, second), max(first, second), is_positive, is_negative, is_unsure
 
 
+@inlined
+def _without(start: float, end: float, gap: tuple[float, float]) -> tuple[float, float]:
+    """Return a piece of time without a gap that reaches across one of its ends."""
+    first, last = gap
+    return last if (first <= start) & (start < last) else start, first if (first < end) & (end <= last) else end
+
+
+@inlined
+def _inside(
+    starts: tuple[bool, bool, bool], a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]
+) -> tuple[float, float, bool]:
+    """Return when all three edges have one sign, and whether there may be more pieces than this one.
+
+    Args:
+        starts: whether each edge has it at first.
+        a, b, c: roots of each.
+    """
+    # an edge that starts with it has it but in the gap between its roots; else only there
+    start = max(0.0 if starts[0] else a[0], max(0.0 if starts[1] else b[0], 0.0 if starts[2] else c[0]))
+    end = min(1.0 if starts[0] else a[1], min(1.0 if starts[1] else b[1], 1.0 if starts[2] else c[1]))
+    p = (a[0] if starts[0] else 2.0, a[1] if starts[0] else 2.0)
+    q = (b[0] if starts[1] else 2.0, b[1] if starts[1] else 2.0)
+    r = (c[0] if starts[2] else 2.0, c[1] if starts[2] else 2.0)
+    for _ in range(3):  # gaps may follow on each other
+        start, end = _without(start, end, p)
+        start, end = _without(start, end, q)
+        start, end = _without(start, end, r)
+    is_split = (
+        ((start < p[0]) & (p[0] < p[1]) & (p[1] < end))
+        | ((start < q[0]) & (q[0] < q[1]) & (q[1] < end))
+        | ((start < r[0]) & (r[0] < r[1]) & (r[1] < end))
+    )
+    return start, end, is_split
+
+
 @jit
 def solve(field: np.ndarray, n: int) -> None:
-    """Set START, END and STATE of `n` pairs.
-
-    Inside, all three edges have one sign. An edge has it until its first root and from its second on, if it starts with
-    it, and between the two if not.
-    """
+    """Set START, END and STATE of `n` pairs: inside, all three edges have one sign."""
     for k in range(_U(n)):
         noise, allowed = field[k + NOISE], field[k + ALLOWED]
         c, d, e = field[k + C0], field[k + C1], field[k + C2]
         a0, a1, a_front, a_back, a_unsure = _edge(c, field[k + H0], field[k + Q0], noise)
         b0, b1, b_front, b_back, b_unsure = _edge(d, field[k + H1], field[k + Q1], noise)
         g0, g1, g_front, g_back, g_unsure = _edge(e, field[k + H2], field[k + Q2], noise)
-        a, b, g = c > 0, d > 0, e > 0
-        front_start = max(0.0 if a else a0, max(0.0 if b else b0, 0.0 if g else g0))
-        front_end = min(a0 if a else a1, min(b0 if b else b1, g0 if g else g1))
-        back_start = max(a0 if a else 0.0, max(b0 if b else 0.0, g0 if g else 0.0))
-        back_end = min(a1 if a else a0, min(b1 if b else b0, g1 if g else g0))
-        a2, b2, g2 = a1 < 1.0, b1 < 1.0, g1 < 1.0
-        front_twice = (a & a2) | (b & b2) | (g & g2)
-        back_twice = ((not a) & a2) | ((not b) & b2) | ((not g) & g2)
+        front_start, front_end, front_split = _inside((c > 0, d > 0, e > 0), (a0, a1), (b0, b1), (g0, g1))
+        back_start, back_end, back_split = _inside((not c > 0, not d > 0, not e > 0), (a0, a1), (b0, b1), (g0, g1))
         may_front = (allowed >= 0) & (not (a_back | b_back | g_back))
         may_back = (allowed <= 0) & (not (a_front | b_front | g_front))
-        is_front = may_front & ((front_start < front_end) | front_twice)
-        is_back = may_back & ((back_start < back_end) | back_twice)
+        is_front, is_back = may_front & (front_start < front_end), may_back & (back_start < back_end)
         is_hard = (
             ((may_front | may_back) & (a_unsure | b_unsure | g_unsure))
-            | (is_front & (is_back | front_twice))
-            | (is_back & back_twice)
+            | (is_front & is_back)
+            | (is_front & front_split)
+            | (is_back & back_split)
         )
         field[k + START] = front_start if is_front else back_start
         field[k + END] = front_end if is_front else back_end
@@ -253,13 +275,14 @@ def gather_covered(batch: Batch, n: int) -> int:
             m = M_AT + 3 * c
             near[count + _U(c * ROOM)] = setup[row, m] + (x * setup[row, m + 1] + y * setup[row, m + 2])
             near[count + _U((4 + c) * ROOM)] = setup[row, D_AT + c]
+        near[count + SIZE] = setup[row, SIZE_AT]
         near[count + FROM], near[count + TO] = field[k + START], field[k + END]
         covered[count] = k
         count += _U(1)
     return np.int64(count)
 
 
-@jit
+@inlined
 def _bounds(c0: float, c1: float, c2: float, c3: float) -> tuple[float, float, float]:
     """Return the least and the greatest of four numbers, and the greatest size."""
     low, high = min(min(c0, c1), min(c2, c3)), max(max(c0, c1), max(c2, c3))
@@ -274,7 +297,6 @@ def restrict(near: np.ndarray, n: int) -> None:
         m0, m1, m2, m3 = near[k + M0], near[k + M1], near[k + M2], near[k + M3]
         d0, d1, d2, d3 = near[k + D0], near[k + D1], near[k + D2], near[k + D3]
         _, _, m_size = _bounds(m0, m1, m2, m3)
-        _, _, d_size = _bounds(d0, d1, d2, d3)
         m0, m1, m2, m3 = restrict_cubic(m0, m1, m2, m3, part)
         d0, d1, d2, d3 = restrict_cubic(d0, d1, d2, d3, part)
         _, _, m_most = _bounds(m0, m1, m2, m3)
@@ -282,7 +304,7 @@ def restrict(near: np.ndarray, n: int) -> None:
         d_least = min(abs(d_low), abs(d_high))
         low, high, _ = _bounds(m0 / d0, m1 / d1, m2 / d2, m3 / d3)
         is_one_sided = (d_low > 0) | (d_high < 0)
-        is_weak = (m_most < CANCELS * m_size) | (d_least < CANCELS * d_size) | (not is_one_sided)
+        is_weak = (m_most < CANCELS * m_size) | (d_least < CANCELS * near[k + SIZE]) | (not is_one_sided)
         near[k + M0], near[k + M1], near[k + M2], near[k + M3] = m0, m1, m2, m3
         near[k + D0], near[k + D1], near[k + D2], near[k + D3] = d0, d1, d2, d3
         near[k + LOW], near[k + HIGH], near[k + WEAK] = low, high, 1.0 if is_weak else 0.0

@@ -1,6 +1,6 @@
 """When a moving triangle covers a ray, one pair at a time: what intervals.py and edges.py do for many at once.
 
-Before: polynomials.py.  After: tiles.py.
+Before: polynomials.py.  After: fill.py.
 Symbols as in edges.py; `work.corner` holds x, y, w, z of the reduced corners: (2 ends, 3 corners, 4).
 Source: as intervals.py; the same operations in the same order, so that all times are the same bits.
 """

@@ -182,6 +182,7 @@ def fill_tile(
     own = borrowed(tile)
     cover, closed = own.cover, own.least  # not of those that grow
     highs, t, hulls = geometry.high, geometry.t, geometry.corners_px
+    is_clipped, allowed_of = geometry.is_clipped, geometry.allowed
     setup, clip, field = batch.setup, geometry.clip, batch.field
     least, n, row_of, n_pairs, n_hidden = 0.0, 0, 0, 0, 0
     for m in range(first, last):
@@ -201,7 +202,7 @@ def fill_tile(
             continue
         times = (t[k, 0], t[k, 1])
         is_whole = times[0] <= view.start and times[1] >= view.end
-        is_set_up, is_hard, allowed = False, geometry.is_clipped[k], float(geometry.allowed[k])
+        is_set_up, is_hard, allowed = False, is_clipped[k], float(allowed_of[k])
         for row in range(first_row, last_row + 1):
             left, right = low, most
             if most - low >= WIDE:
@@ -220,7 +221,7 @@ def fill_tile(
             n_pairs += count
             if not (is_set_up or is_hard):
                 is_set_up = True
-                is_hard = not batches.set_up(clip, k, middle, view.orders_by_w, (setup, row_of))
+                batches.set_up(clip, k, middle, view.orders_by_w, (setup, row_of))
             if is_hard:
                 tile = with_room(tile, MOST_PIECES * count)
                 for m_pixel in range(count):
@@ -238,7 +239,7 @@ def fill_tile(
                 for c in range(batches.N_SETUP):
                     setup[0, c] = setup[row_of, c]
                 n, row_of = 0, 0
-        if is_set_up and not is_hard:
+        if is_set_up:
             row_of = row_of + 1 if n > 0 else 0
     tile.counts[1] += n_pairs
     tile.counts[2] += n_hidden

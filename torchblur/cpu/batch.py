@@ -30,7 +30,8 @@ UNSURE = 1e-12  # of the largest product: an edge function this small may have e
 SLOW = 4e6  # times as much: an edge function that passes zero by half this slope does so at an unsure time (1e-10)
 CANCELS = 1e-3  # of the greatest sum of sizes: a result this small has lost as many digits
 
-# columns of `Batch.setup`: K, KX, KY of c, h, q of each edge; M0, MX, MY of each coefficient; D; where M0 holds; noise; size of D's sums
+# columns of `Batch.setup`: K, KX, KY of c, h, q of each edge; M0, MX, MY of each coefficient; D; where M0 holds; noise;
+# size of the sums of D
 M_AT, D_AT, AT_X, AT_Y, NOISE_AT, SIZE_AT, N_SETUP = 27, 39, 43, 44, 45, 46, 47
 
 # Fields of the flat arrays, ROOM numbers each, one of a pair. They are unsigned, as else each access asks for a sign.

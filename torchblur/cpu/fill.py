@@ -22,6 +22,7 @@ from torchblur.hidden import CLEARLY
 from torchblur.intervals import SHORTEST
 from torchblur.pairs import ROUNDING
 from torchblur.prisms import BOUND_SLACK_PX
+from torchblur.sort import TIE
 
 MOST_PIECES = 16  # more than the intervals of one pair
 EVERY = 16  # prisms after which the tile's cover is looked at anew
@@ -75,7 +76,8 @@ def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int,
             low, high = min(low, ratio), max(high, ratio)
         if not (is_front or is_back):
             low, high = -np.inf, np.inf
-        data[n, T_START], data[n, T_END], data[n, LOW], data[n, HIGH] = start, end, low, high
+        data[n, T_START], data[n, T_END] = start, end
+        data[n, LOW], data[n, HIGH] = low - TIE * abs(low), high + TIE * abs(high)
         tile.prism[n], tile.next[n] = k, pixel
     _keep(geometry, view, tile, n_pieces)
 
@@ -131,7 +133,9 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
         for c in range(8):
             data[place, NUM + c] = near[m + _U(c * batches.ROOM)]
         data[place, T_START], data[place, T_END] = near[m + batches.FROM], near[m + batches.TO]
-        data[place, LOW], data[place, HIGH] = near[m + batches.LOW], near[m + batches.HIGH]
+        # ranges that are apart are so by more than surfaces that count as coplanar
+        low, high = near[m + batches.LOW], near[m + batches.HIGH]
+        data[place, LOW], data[place, HIGH] = low - TIE * abs(low), high + TIE * abs(high)
         prism[place], following[place] = who[pair, 0], who[pair, 2]
         count += 1
     _keep(geometry, view, own, count)

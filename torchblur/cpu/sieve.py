@@ -1,6 +1,6 @@
 """Which pairs of receivers and casters may block a light at all, compiled: most candidates do not.
 
-Before: jit.py, blocking.py.  After: shadows.py.
+Before: jit.py, blocking.py.  After: join.py.
 Symbols: as in blocking.py, whose tests these are in the same arithmetic: a pair is left out only where the Bernstein
 coefficients show, on every slice that is looked at, that no time has all signs alike.
 Source: ours.
@@ -10,80 +10,78 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchblur.blocking import HALVINGS, NOISE, Receivers
 from torchblur.casters import Casters
 from torchblur.cpu.jit import jit
-from torchblur.lights import DirectionalLight, Light, along
+from torchblur.lights import DirectionalLight, Light
 
 ROOM = 16.0  # times the rounding that blocking.py allows for: what is left out there is left out, nothing else
-MANY = 1 << 16  # pairs; fewer are not worth loading compiled code
 FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
 FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
 
 
-def sift(light: Light, receivers: Receivers, casters: Casters, pairs: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return those of the pairs, receiver and caster (n,) that share some time, that may block the light.
-
-    Source: ours.
-    """
-    receiver, caster = pairs
+def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tuple, tuple, tuple]:
+    """Return what `may_block` reads of receivers, casters and a light; each thing's numbers lie side by side."""
     is_directional = isinstance(light, DirectionalLight)
-    shines = light.direction if is_directional else light.position
-    start = torch.maximum(receivers.t[0, receiver], casters.t_open[caster])
-    end = torch.minimum(receivers.t[1, receiver], casters.t_close[caster])
-    ends = torch.stack([along(shines, start), along(shines, end)]).permute(2, 0, 1).contiguous()
+    shines = (light.direction if is_directional else light.position).detach().to(torch.float64).reshape(-1, 3)
     thing = [a.contiguous().numpy() for a in (receivers.place.permute(2, 0, 1), receivers.scale.T, receivers.t.T)]
-    caster_t = torch.stack([casters.t_open, casters.t_close], dim=1)
-    blocker = casters.world.permute(3, 0, 1, 2).contiguous().numpy(), caster_t.numpy(), casters.gap
-    may = _sift(receiver.numpy(), caster.numpy(), tuple(thing), blocker, (ends.numpy(), is_directional))
-    chosen = torch.from_numpy(may).nonzero().flatten()
-    return receiver[chosen], caster[chosen]
+    slices = torch.stack([casters.t_open, casters.t_close], dim=1)
+    world = casters.world.permute(3, 0, 1, 2).contiguous()
+    return tuple(thing), (world.numpy(), slices.numpy(), casters.gap), (shines.contiguous().numpy(), is_directional)
 
 
 @jit
-def _sift(receiver, caster, thing, blocker, light):
-    """Return (n,) whether each pair may block."""
-    place, scale, times = thing
-    world, slices, gap = blocker
-    ends, is_directional = light
-    n = len(receiver)
-    may = np.ones(n, dtype=np.bool_)
-    p, s = np.empty((4, 3)), np.empty(3)
-    corner, lamp = np.empty((2, 3, 3)), np.empty((2, 3))
-    signs, room = np.empty((HALVINGS + 1, 5, 6)), np.empty(5)
-    scratch = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3))
+def scratch_room():
+    """Return what `may_block` works in."""
+    point = np.empty((4, 3)), np.empty(3)
+    work = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3))
+    return point, np.empty((2, 3, 3)), np.empty((2, 3)), (np.empty((HALVINGS + 1, 5, 6)), np.empty(5)), work
+
+
+@jit
+def may_block(pair, arrays, room):
+    """Return whether a pair (receiver, caster) that shares some time may block the light."""
+    r, c = pair
+    (place, scale, times), (world, slices, gap), (shines, is_directional) = arrays
+    (p, s), corner, lamp, (signs, noise), scratch = room
     is_instant = place.shape[1] == 1
-    for k in range(n):
-        r, c = receiver[k], caster[k]
-        t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
-        if is_instant:
-            p[:] = place[r, 0]
-            s[:] = scale[r, 0]
-        else:
-            p[:] = place[r]
-            s[:] = scale[r]
-            length = times[r, 1] - times[r, 0]
-            u_start = (t_start - times[r, 0]) / length
-            u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
-            if u_start > 0 or u_end < 1:
-                for d in range(3):
-                    _restrict(p[:, d], u_start, u_end)
-                _restrict(s, u_start, u_end)
-        for e in range(2):
-            t = t_end if e == 1 and not is_instant else t_start
-            u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
-            for i in range(3):
-                for d in range(3):
-                    corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
-        lamp[:] = ends[k]
-        if is_directional:
-            n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], room))
-        else:
-            n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], room))
-        may[k] = _may_be_alike(signs, room, n_signs, 0 if is_instant else HALVINGS)
-    return may
+    t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
+    if is_instant:
+        p[:] = place[r, 0]
+        s[:] = scale[r, 0]
+    else:
+        p[:] = place[r]
+        s[:] = scale[r]
+        length = times[r, 1] - times[r, 0]
+        u_start = (t_start - times[r, 0]) / length
+        u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
+        if u_start > 0 or u_end < 1:
+            for d in range(3):
+                _restrict(p[:, d], u_start, u_end)
+            _restrict(s, u_start, u_end)
+    for e in range(2):
+        t = t_end if e == 1 and not is_instant else t_start
+        u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
+        for i in range(3):
+            for d in range(3):
+                corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
+        _along(shines, t, lamp[e])
+    if is_directional:
+        n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
+    else:
+        n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
+    return _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
+
+
+@jit
+def _along(knots, t, out):
+    """Write the value of knots (n, 3) at the shutter time `t` to `out` (3,)."""
+    last = len(knots) - 1
+    k = min(max(int(t * last), 0), max(last - 1, 0))
+    u = t * last - k
+    for d in range(3):
+        out[d] = knots[0, d] if last == 0 else (1 - u) * knots[k, d] + u * knots[k + 1, d]
 
 
 @jit

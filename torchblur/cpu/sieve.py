@@ -35,7 +35,7 @@ def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tup
 def scratch_room():
     """Return what `may_block` works in."""
     point = np.empty((4, 3)), np.empty(3)
-    work = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3))
+    work = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 2, 4))
     return point, np.empty((2, 3, 3)), np.empty((2, 3)), (np.empty((HALVINGS + 1, 5, 6)), np.empty(5)), work
 
 
@@ -71,7 +71,7 @@ def may_block(pair, arrays, room):
         n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
     else:
         n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
-    return _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
+    return n_signs > 0 and _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
 
 
 @jit
@@ -146,9 +146,9 @@ def _largest(values):
 
 @jit
 def _from_position(corner, lamp, point, scratch, out):
-    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many they are."""
+    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many they are, 0 where the first exclude it."""
     p, s, gap = point
-    normal, vector, _ = scratch
+    normal, vector, _, rest = scratch
     signs, room = out
     scale, away = (s[0] + s[1] + s[2]) / 3, 0.0
     for d in range(3):
@@ -168,7 +168,7 @@ def _from_position(corner, lamp, point, scratch, out):
     size0, size1, size2 = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
     sizes = size0 * size1, size1 * size2, size2 * size0
     signs[:] = 0.0
-    volume = vector[:, 0].copy()
+    volume = rest[0, 0]
     for e in range(3):
         i, j = e, FIRST[e]
         _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
@@ -176,6 +176,8 @@ def _from_position(corner, lamp, point, scratch, out):
         if e == 1:
             _dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
         room[e] = ROOM * NOISE * reach * sizes[e]
+        if e > 0 and _is_excluded(signs, room, e + 1):
+            return 0
     distance = np.sqrt(square) / scale
     bias = min(away / distance, 1.0) if distance > 0 else 1.0
     for k in range(6):
@@ -193,9 +195,9 @@ def _from_position(corner, lamp, point, scratch, out):
 
 @jit
 def _along_direction(corner, way, point, scratch, out):
-    """Write the polynomials of a direction, and their rounding, to `out`; return how many they are."""
+    """Write the polynomials of a direction, and their rounding, to `out`; return how many they are, 0 where the first exclude it."""
     p, s, gap = point
-    normal, vector, side = scratch
+    normal, vector, side, rest = scratch
     signs, room = out
     scale, away, square, span = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0, 0.0
     for d in range(3):
@@ -205,7 +207,7 @@ def _along_direction(corner, way, point, scratch, out):
     reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
     size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
     signs[:] = 0.0
-    constant = vector[:, 0].copy()
+    constant = rest[0, 0]
     for e in range(3):
         i, j = e, FIRST[e]
         for a in range(2):
@@ -218,7 +220,9 @@ def _along_direction(corner, way, point, scratch, out):
         _dot_2_1(normal, way[0], way[1], constant)
         _add_2_3(s, constant, 1.0, signs[e])
         room[e] = ROOM * NOISE * speed * (reach * (size[i] + size[j]) + largest * size[i] * size[j])
-    first, second = np.empty((2, 3)), np.empty((2, 3))
+        if e > 0 and _is_excluded(signs, room, e + 1):
+            return 0
+    first, second = rest[1], rest[2]
     for d in range(3):
         for a in range(2):
             first[a, d], second[a, d] = corner[a, 1, d] - corner[a, 0, d], corner[a, 2, d] - corner[a, 0, d]
@@ -236,12 +240,24 @@ def _along_direction(corner, way, point, scratch, out):
 
 
 @jit
+def _is_excluded(signs, room, n_signs):
+    """Return whether the first coefficients `signs` (5, 6) show that no time has one sign, to `room` (5,)."""
+    can_be_up, can_be_down = True, True
+    for q in range(n_signs):
+        low, high = signs[q, 0], signs[q, 0]
+        for k in range(1, 6):
+            low, high = min(low, signs[q, k]), max(high, signs[q, k])
+        can_be_up &= high >= -room[q]
+        can_be_down &= low <= room[q]
+    return not (can_be_up or can_be_down)
+
+
+@jit
 def _may_be_alike(signs, room, n_signs, n_halvings):
     """Return whether coefficients `signs` (halvings + 1, 5, 6), of which the first are given, may have one sign at some
     time, to `room` (5,).
     """
-    part = np.zeros(n_halvings + 1, dtype=np.int64)  # which half of each level is looked at; 2 when both are done
-    depth = 0
+    halves, depth = 0, 0  # bit l: the second half of level l is looked at
     while True:
         can_be_up, can_be_down = True, True
         surely_up, surely_down = True, True
@@ -260,13 +276,13 @@ def _may_be_alike(signs, room, n_signs, n_halvings):
                 return True
             _halve(signs, depth, n_signs)
             depth += 1
-            part[depth] = 0
+            halves &= ~(1 << depth)
             continue
-        while depth > 0 and part[depth] == 1:
+        while depth > 0 and halves >> depth & 1:
             depth -= 1
         if depth == 0:
             return False
-        part[depth] = 1
+        halves |= 1 << depth
         _second_half(signs, depth, n_signs)
 
 

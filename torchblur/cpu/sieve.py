@@ -146,7 +146,7 @@ def _largest(values):
 
 @jit
 def _from_position(corner, lamp, point, scratch, out):
-    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many they are, 0 where the first exclude it."""
+    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many, 0 if excluded."""
     p, s, gap = point
     normal, vector, _, rest = scratch
     signs, room = out
@@ -195,7 +195,7 @@ def _from_position(corner, lamp, point, scratch, out):
 
 @jit
 def _along_direction(corner, way, point, scratch, out):
-    """Write the polynomials of a direction, and their rounding, to `out`; return how many they are, 0 where the first exclude it."""
+    """Write the polynomials of a direction, and their rounding, to `out`; return how many, 0 if excluded."""
     p, s, gap = point
     normal, vector, side, rest = scratch
     signs, room = out

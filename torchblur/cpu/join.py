@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.sieve import may_block, scratch_room
 
 Things = tuple[Tensor, Tensor, Tensor]
@@ -30,16 +30,17 @@ def join(receiver: Things, caster: Things, sees_all: bool, arrays: tuple) -> tup
     Source: ours.
     """
     a, b = ((w.numpy(), box.T.contiguous().numpy(), level.numpy()) for w, box, level in (receiver, caster))
-    found, n = _join_all(a, b, arrays) if sees_all else _join_levels(a, b, arrays)
+    room = scratch_room()
+    found, n = _join_all(a, b, arrays, room) if sees_all else _join_levels(a, b, arrays, room)
     r, c = torch.from_numpy(found).unbind(1)
     return (r, c), n
 
 
 @jit
-def _join_all(a, b, arrays):
+def _join_all(a, b, arrays, room):
     """Return the pairs (n, 2) that may block among all, and how many were candidates."""
     out, count, n = np.empty((STARTING_ROOM, 2), dtype=np.int64), 0, 0
-    room = scratch_room()
+    a, b, arrays, room = borrowed(a), borrowed(b), borrowed(arrays), borrowed(room)
     for i in range(len(a[0])):
         for j in range(len(b[0])):
             if _meet(a, b, (i, j), arrays):
@@ -54,10 +55,10 @@ def _join_all(a, b, arrays):
 
 
 @jit
-def _join_levels(a, b, arrays):
+def _join_levels(a, b, arrays, room):
     """Return the pairs (n, 2) that may block among those that touch a common cell, and how many were candidates."""
     out, count, n = np.empty((STARTING_ROOM, 2), dtype=np.int64), 0, 0
-    room = scratch_room()
+    a, b, arrays, room = borrowed(a), borrowed(b), borrowed(arrays), borrowed(room)
     finest_a, finest_b = a[2].max(), b[2].max()
     begin = np.empty(4 ** min(finest_a, finest_b) + 2, dtype=np.int64)
     for level_a in range(finest_a + 1):
@@ -99,7 +100,7 @@ def _grown(out):
     return more
 
 
-@jit
+@inlined
 def _meet(a, b, places, arrays):
     """Return whether the rectangles, depths and times of two things overlap and they are different faces."""
     i, j = places

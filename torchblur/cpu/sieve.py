@@ -13,7 +13,7 @@ import torch
 
 from torchblur.blocking import HALVINGS, NOISE, Receivers
 from torchblur.casters import Casters
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inlined, jit
 from torchblur.lights import DirectionalLight, Light
 
 ROOM = 16.0  # times the rounding that blocking.py allows for: what is left out there is left out, nothing else
@@ -31,7 +31,6 @@ def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tup
     return tuple(thing), (world.numpy(), slices.numpy(), casters.gap), (shines.contiguous().numpy(), is_directional)
 
 
-@jit
 def scratch_room():
     """Return what `may_block` works in."""
     point = np.empty((4, 3)), np.empty(3)
@@ -74,7 +73,7 @@ def may_block(pair, arrays, room):
     return n_signs > 0 and _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
 
 
-@jit
+@inlined
 def _along(knots, t, out):
     """Write the value of knots (n, 3) at the shutter time `t` to `out` (3,)."""
     last = len(knots) - 1
@@ -84,7 +83,7 @@ def _along(knots, t, out):
         out[d] = knots[0, d] if last == 0 else (1 - u) * knots[k, d] + u * knots[k + 1, d]
 
 
-@jit
+@inlined
 def _restrict(c, start, end):
     """Turn Bernstein coefficients (n,) into those on [start, end]."""
     n = len(c)
@@ -97,7 +96,7 @@ def _restrict(c, start, end):
             c[i] = (1 - share) * c[i] + share * c[i + 1]
 
 
-@jit
+@inlined
 def _cross_linear(a0, a1, b0, b1, out):
     """Write the coefficients (3, 3) of the cross product of linear vectors to `out`."""
     for d in range(3):
@@ -107,7 +106,7 @@ def _cross_linear(a0, a1, b0, b1, out):
         out[2, d] = a1[i] * b1[j] - a1[j] * b1[i]
 
 
-@jit
+@inlined
 def _add_dot_2_3(a, b, sign, out):
     """Add the dot products of vectors of degree 2, (3, 3), and 3, (4, 3), to `out` (6,), `sign` times."""
     for i in range(3):
@@ -116,7 +115,7 @@ def _add_dot_2_3(a, b, sign, out):
             out[i + j] += sign * FIVE_OF_2_3[i, i + j] * dot
 
 
-@jit
+@inlined
 def _add_2_3(a, b, sign, out):
     """Add the product of polynomials of degree 2, (3,), and 3, (4,), to `out` (6,), `sign` times."""
     for i in range(3):
@@ -124,7 +123,7 @@ def _add_2_3(a, b, sign, out):
             out[i + j] += sign * FIVE_OF_2_3[i, i + j] * a[i] * b[j]
 
 
-@jit
+@inlined
 def _dot_2_1(a, b0, b1, out):
     """Write the dot product of vectors of degree 2, (3, 3), and 1 to `out` (4,)."""
     out[:] = 0.0
@@ -239,7 +238,7 @@ def _along_direction(corner, way, point, scratch, out):
     return 4
 
 
-@jit
+@inlined
 def _is_excluded(signs, room, n_signs):
     """Return whether the first coefficients `signs` (5, 6) show that no time has one sign, to `room` (5,)."""
     can_be_up, can_be_down = True, True

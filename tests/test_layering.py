@@ -47,6 +47,7 @@ TORCHBLUR = [
     "shading",
     "blocking",
     "cpu.sieve",
+    "cpu.join",
     "shadow_pairs",
     "shadows",
     "averages",

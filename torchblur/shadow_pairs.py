@@ -1,6 +1,6 @@
 """Which triangles may come between a light and which points: candidates from bounds as the light sees them.
 
-Before: casters.py, blocking.py.  After: shadows.py.
+Before: casters.py, blocking.py, cpu/join.py.  After: shadows.py.
 Symbols: a view is a flat picture of the scene from the light: one of the six sides of a cube around a place, or a plane
 that a direction crosses between two knots of it. Both what casts and what receives sweep a rectangle in it. Level l of
 a view has 2^l by 2^l cells; things lie in the finest level in whose cells they fit, and then touch at most 2 by 2.
@@ -19,6 +19,8 @@ from torch import Tensor
 from torchblur import bernstein, packed
 from torchblur.blocking import Receivers
 from torchblur.casters import Casters
+from torchblur.cpu.join import join
+from torchblur.cpu.sieve import arrays_of
 from torchblur.lights import DirectionalLight, Light, along, unit
 from torchblur.prisms import swept_bounds_px
 
@@ -58,6 +60,23 @@ def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Ite
                 kept = []
     if kept:
         yield together(kept)
+
+
+def sifted_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[tuple[Tensor, Tensor], int]]:
+    """Yield those of `candidate_pairs`, in its order, that may block the light by a closer look, and how many it has:
+    compiled, for tensors on the CPU. Source: ours.
+    """
+    views = _directional_views if isinstance(light, DirectionalLight) else _cube_views
+    faces = receivers.face.contiguous().numpy(), casters.face.contiguous().numpy()
+    arrays = faces, arrays_of(light, receivers, casters)
+    for view in views(light, receivers, casters):
+        things = _in_common_box(*view)
+        n, m = (len(thing.which) for thing in things)
+        if n * m:
+            boxes = ((t.which, torch.cat([t.low, t.high, t.depth.unsqueeze(0)]), _level(t)) for t in things)
+            (r, c), n_seen = join(*boxes, n * m <= FEW_PAIRS, arrays)
+            for start in range(0, max(len(r), 1), AT_ONCE):
+                yield (r[start : start + AT_ONCE], c[start : start + AT_ONCE]), 0 if start else n_seen
 
 
 def together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

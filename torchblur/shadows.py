@@ -1,6 +1,6 @@
 """How much of each light reaches points: exact ranges of time in which casters block it, and what these let through.
 
-Before: shadow_pairs.py, blocking.py, cpu/sieve.py.  After: averages.py, instant.py (at instants), nodes.py (exact).
+Before: shadow_pairs.py, blocking.py.  After: averages.py, instant.py (at instants), nodes.py (exact).
 Symbols: K receivers (see blocking.py); R ranges of one light; a range of opaque casters is their union.
 The depth-time ranges of Hong & Oh 2018 hold, for a texel of a map, the times at which triangles cover it; here they
 hold, for each point that the camera sees, the times at which triangles block its light: there is no texel, no bias
@@ -19,15 +19,15 @@ from torch import Tensor
 from torchblur import packed
 from torchblur.blocking import Receivers, when_blocked
 from torchblur.casters import Casters
-from torchblur.cpu import sieve
 from torchblur.lights import DirectionalLight, Light, along
 from torchblur.shading import Points
-from torchblur.shadow_pairs import AT_ONCE, candidate_pairs, together
+from torchblur.shadow_pairs import candidate_pairs, sifted_pairs
 from torchblur.sort import SAME_TIME, argsort_by
 from torchblur.surfaces import Surfaces
 from torchblur.texture import lookup
 
 NOTHING = -1  # the caster of a range of opaque ones
+MANY = 1 << 20  # receivers times casters; fewer are not worth loading compiled code
 TEXTURED_SLICES = 64  # into which a range of a caster with varying opacity is cut: that is sampled, not certified
 
 
@@ -145,16 +145,11 @@ def find_shadows(surfaces: Surfaces, receivers: Receivers, is_due: tuple[Tensor,
 
 def _likely_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[tuple[Tensor, Tensor], int]]:
     """Yield the pairs that may block a light, in portions, and how many candidates these were among."""
-    kept, n, total = [], 0, 0
-    for pairs in candidate_pairs(light, receivers, casters):
-        n, total = n + len(pairs[0]), total + len(pairs[0])
-        is_worth_it = total >= sieve.MANY and pairs[0].device.type == "cpu"
-        kept.append(sieve.sift(light, receivers, casters, pairs) if is_worth_it else pairs)
-        if sum(len(r) for r, _ in kept) >= AT_ONCE:
-            yield together(kept), n
-            kept, n = [], 0
-    if kept:
-        yield together(kept), n
+    if receivers.count * casters.count >= MANY and receivers.face.device.type == "cpu":
+        yield from sifted_pairs(light, receivers, casters)
+    else:
+        for pairs in candidate_pairs(light, receivers, casters):
+            yield pairs, len(pairs[0])
 
 
 def visible_at(surfaces: Surfaces, point: Tensor, t: Tensor, face: Tensor) -> Tensor | None:

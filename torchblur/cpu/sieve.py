@@ -1,6 +1,6 @@
 """Which pairs of receivers and casters may block a light at all, compiled: most candidates do not.
 
-Before: jit.py, blocking.py.  After: shadows.py.
+Before: jit.py, blocking.py.  After: join.py.
 Symbols: as in blocking.py, whose tests these are in the same arithmetic: a pair is left out only where the Bernstein
 coefficients show, on every slice that is looked at, that no time has all signs alike.
 Source: ours.
@@ -10,83 +10,80 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchblur.blocking import HALVINGS, NOISE, Receivers
 from torchblur.casters import Casters
-from torchblur.cpu.jit import jit
-from torchblur.lights import DirectionalLight, Light, along
+from torchblur.cpu.jit import inlined, jit
+from torchblur.lights import DirectionalLight, Light
 
 ROOM = 16.0  # times the rounding that blocking.py allows for: what is left out there is left out, nothing else
-MANY = 1 << 16  # pairs; fewer are not worth loading compiled code
 FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
 FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
 
 
-def sift(light: Light, receivers: Receivers, casters: Casters, pairs: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
-    """Return those of the pairs, receiver and caster (n,) that share some time, that may block the light.
-
-    Source: ours.
-    """
-    receiver, caster = pairs
+def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tuple, tuple, tuple]:
+    """Return what `may_block` reads of receivers, casters and a light; each thing's numbers lie side by side."""
     is_directional = isinstance(light, DirectionalLight)
-    shines = light.direction if is_directional else light.position
-    start = torch.maximum(receivers.t[0, receiver], casters.t_open[caster])
-    end = torch.minimum(receivers.t[1, receiver], casters.t_close[caster])
-    ends = torch.stack([along(shines, start), along(shines, end)]).permute(2, 0, 1).contiguous()
+    shines = (light.direction if is_directional else light.position).detach().to(torch.float64).reshape(-1, 3)
     thing = [a.contiguous().numpy() for a in (receivers.place.permute(2, 0, 1), receivers.scale.T, receivers.t.T)]
-    caster_t = torch.stack([casters.t_open, casters.t_close], dim=1)
-    blocker = casters.world.permute(3, 0, 1, 2).contiguous().numpy(), caster_t.numpy(), casters.gap
-    may = _sift(receiver.numpy(), caster.numpy(), tuple(thing), blocker, (ends.numpy(), is_directional))
-    chosen = torch.from_numpy(may).nonzero().flatten()
-    return receiver[chosen], caster[chosen]
+    slices = torch.stack([casters.t_open, casters.t_close], dim=1)
+    world = casters.world.permute(3, 0, 1, 2).contiguous()
+    return tuple(thing), (world.numpy(), slices.numpy(), casters.gap), (shines.contiguous().numpy(), is_directional)
+
+
+def scratch_room():
+    """Return what `may_block` works in."""
+    point = np.empty((4, 3)), np.empty(3)
+    work = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 2, 4))
+    return point, np.empty((2, 3, 3)), np.empty((2, 3)), (np.empty((HALVINGS + 1, 5, 6)), np.empty(5)), work
 
 
 @jit
-def _sift(receiver, caster, thing, blocker, light):
-    """Return (n,) whether each pair may block."""
-    place, scale, times = thing
-    world, slices, gap = blocker
-    ends, is_directional = light
-    n = len(receiver)
-    may = np.ones(n, dtype=np.bool_)
-    p, s = np.empty((4, 3)), np.empty(3)
-    corner, lamp = np.empty((2, 3, 3)), np.empty((2, 3))
-    signs, room = np.empty((HALVINGS + 1, 5, 6)), np.empty(5)
-    scratch = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3))
+def may_block(pair, arrays, room):
+    """Return whether a pair (receiver, caster) that shares some time may block the light."""
+    r, c = pair
+    (place, scale, times), (world, slices, gap), (shines, is_directional) = arrays
+    (p, s), corner, lamp, (signs, noise), scratch = room
     is_instant = place.shape[1] == 1
-    for k in range(n):
-        r, c = receiver[k], caster[k]
-        t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
-        if is_instant:
-            p[:] = place[r, 0]
-            s[:] = scale[r, 0]
-        else:
-            p[:] = place[r]
-            s[:] = scale[r]
-            length = times[r, 1] - times[r, 0]
-            u_start = (t_start - times[r, 0]) / length
-            u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
-            if u_start > 0 or u_end < 1:
-                for d in range(3):
-                    _restrict(p[:, d], u_start, u_end)
-                _restrict(s, u_start, u_end)
-        for e in range(2):
-            t = t_end if e == 1 and not is_instant else t_start
-            u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
-            for i in range(3):
-                for d in range(3):
-                    corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
-        lamp[:] = ends[k]
-        if is_directional:
-            n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], room))
-        else:
-            n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], room))
-        may[k] = _may_be_alike(signs, room, n_signs, 0 if is_instant else HALVINGS)
-    return may
+    t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
+    if is_instant:
+        p[:] = place[r, 0]
+        s[:] = scale[r, 0]
+    else:
+        p[:] = place[r]
+        s[:] = scale[r]
+        length = times[r, 1] - times[r, 0]
+        u_start = (t_start - times[r, 0]) / length
+        u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
+        if u_start > 0 or u_end < 1:
+            for d in range(3):
+                _restrict(p[:, d], u_start, u_end)
+            _restrict(s, u_start, u_end)
+    for e in range(2):
+        t = t_end if e == 1 and not is_instant else t_start
+        u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
+        for i in range(3):
+            for d in range(3):
+                corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
+        _along(shines, t, lamp[e])
+    if is_directional:
+        n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
+    else:
+        n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
+    return n_signs > 0 and _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
 
 
-@jit
+@inlined
+def _along(knots, t, out):
+    """Write the value of knots (n, 3) at the shutter time `t` to `out` (3,)."""
+    last = len(knots) - 1
+    k = min(max(int(t * last), 0), max(last - 1, 0))
+    u = t * last - k
+    for d in range(3):
+        out[d] = knots[0, d] if last == 0 else (1 - u) * knots[k, d] + u * knots[k + 1, d]
+
+
+@inlined
 def _restrict(c, start, end):
     """Turn Bernstein coefficients (n,) into those on [start, end]."""
     n = len(c)
@@ -99,7 +96,7 @@ def _restrict(c, start, end):
             c[i] = (1 - share) * c[i] + share * c[i + 1]
 
 
-@jit
+@inlined
 def _cross_linear(a0, a1, b0, b1, out):
     """Write the coefficients (3, 3) of the cross product of linear vectors to `out`."""
     for d in range(3):
@@ -109,7 +106,7 @@ def _cross_linear(a0, a1, b0, b1, out):
         out[2, d] = a1[i] * b1[j] - a1[j] * b1[i]
 
 
-@jit
+@inlined
 def _add_dot_2_3(a, b, sign, out):
     """Add the dot products of vectors of degree 2, (3, 3), and 3, (4, 3), to `out` (6,), `sign` times."""
     for i in range(3):
@@ -118,7 +115,7 @@ def _add_dot_2_3(a, b, sign, out):
             out[i + j] += sign * FIVE_OF_2_3[i, i + j] * dot
 
 
-@jit
+@inlined
 def _add_2_3(a, b, sign, out):
     """Add the product of polynomials of degree 2, (3,), and 3, (4,), to `out` (6,), `sign` times."""
     for i in range(3):
@@ -126,7 +123,7 @@ def _add_2_3(a, b, sign, out):
             out[i + j] += sign * FIVE_OF_2_3[i, i + j] * a[i] * b[j]
 
 
-@jit
+@inlined
 def _dot_2_1(a, b0, b1, out):
     """Write the dot product of vectors of degree 2, (3, 3), and 1 to `out` (4,)."""
     out[:] = 0.0
@@ -148,9 +145,9 @@ def _largest(values):
 
 @jit
 def _from_position(corner, lamp, point, scratch, out):
-    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many they are."""
+    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many, 0 if excluded."""
     p, s, gap = point
-    normal, vector, _ = scratch
+    normal, vector, _, rest = scratch
     signs, room = out
     scale, away = (s[0] + s[1] + s[2]) / 3, 0.0
     for d in range(3):
@@ -170,7 +167,7 @@ def _from_position(corner, lamp, point, scratch, out):
     size0, size1, size2 = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
     sizes = size0 * size1, size1 * size2, size2 * size0
     signs[:] = 0.0
-    volume = vector[:, 0].copy()
+    volume = rest[0, 0]
     for e in range(3):
         i, j = e, FIRST[e]
         _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
@@ -178,6 +175,8 @@ def _from_position(corner, lamp, point, scratch, out):
         if e == 1:
             _dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
         room[e] = ROOM * NOISE * reach * sizes[e]
+        if e > 0 and _is_excluded(signs, room, e + 1):
+            return 0
     distance = np.sqrt(square) / scale
     bias = min(away / distance, 1.0) if distance > 0 else 1.0
     for k in range(6):
@@ -195,9 +194,9 @@ def _from_position(corner, lamp, point, scratch, out):
 
 @jit
 def _along_direction(corner, way, point, scratch, out):
-    """Write the polynomials of a direction, and their rounding, to `out`; return how many they are."""
+    """Write the polynomials of a direction, and their rounding, to `out`; return how many, 0 if excluded."""
     p, s, gap = point
-    normal, vector, side = scratch
+    normal, vector, side, rest = scratch
     signs, room = out
     scale, away, square, span = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0, 0.0
     for d in range(3):
@@ -207,7 +206,7 @@ def _along_direction(corner, way, point, scratch, out):
     reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
     size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
     signs[:] = 0.0
-    constant = vector[:, 0].copy()
+    constant = rest[0, 0]
     for e in range(3):
         i, j = e, FIRST[e]
         for a in range(2):
@@ -220,7 +219,9 @@ def _along_direction(corner, way, point, scratch, out):
         _dot_2_1(normal, way[0], way[1], constant)
         _add_2_3(s, constant, 1.0, signs[e])
         room[e] = ROOM * NOISE * speed * (reach * (size[i] + size[j]) + largest * size[i] * size[j])
-    first, second = np.empty((2, 3)), np.empty((2, 3))
+        if e > 0 and _is_excluded(signs, room, e + 1):
+            return 0
+    first, second = rest[1], rest[2]
     for d in range(3):
         for a in range(2):
             first[a, d], second[a, d] = corner[a, 1, d] - corner[a, 0, d], corner[a, 2, d] - corner[a, 0, d]
@@ -237,13 +238,25 @@ def _along_direction(corner, way, point, scratch, out):
     return 4
 
 
+@inlined
+def _is_excluded(signs, room, n_signs):
+    """Return whether the first coefficients `signs` (5, 6) show that no time has one sign, to `room` (5,)."""
+    can_be_up, can_be_down = True, True
+    for q in range(n_signs):
+        low, high = signs[q, 0], signs[q, 0]
+        for k in range(1, 6):
+            low, high = min(low, signs[q, k]), max(high, signs[q, k])
+        can_be_up &= high >= -room[q]
+        can_be_down &= low <= room[q]
+    return not (can_be_up or can_be_down)
+
+
 @jit
 def _may_be_alike(signs, room, n_signs, n_halvings):
     """Return whether coefficients `signs` (halvings + 1, 5, 6), of which the first are given, may have one sign at some
     time, to `room` (5,).
     """
-    part = np.zeros(n_halvings + 1, dtype=np.int64)  # which half of each level is looked at; 2 when both are done
-    depth = 0
+    halves, depth = 0, 0  # bit l: the second half of level l is looked at
     while True:
         can_be_up, can_be_down = True, True
         surely_up, surely_down = True, True
@@ -262,13 +275,13 @@ def _may_be_alike(signs, room, n_signs, n_halvings):
                 return True
             _halve(signs, depth, n_signs)
             depth += 1
-            part[depth] = 0
+            halves &= ~(1 << depth)
             continue
-        while depth > 0 and part[depth] == 1:
+        while depth > 0 and halves >> depth & 1:
             depth -= 1
         if depth == 0:
             return False
-        part[depth] = 1
+        halves |= 1 << depth
         _second_half(signs, depth, n_signs)
 
 

@@ -219,7 +219,7 @@ def _run_record(plan: Plan) -> dict[str, Any]:
 def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) -> list[str]:
     """Return one line for each field in which a folder's data differ from what is asked for."""
     problems = []
-    as_before = {"storage": "folder"} | {name: DatasetSpec.model_fields[name].default for name in ADDED_LATER}
+    as_before = {"storage": "folder"} | ADDED_LATER
     was_spec, now_spec = as_before | found["spec"], wanted["spec"]
     fixed = set(was_spec) | set(now_spec)
     fixed -= set(NOT_IN_THE_BYTES)

@@ -56,6 +56,8 @@ class Arguments:
     """Frames per second at which a sequence of frames is played; an animated file has its own times."""
     lighting: Literal["painted", "lamps", "mixed"] = "painted"
     """Light painted into the colours; lamps that move and cast shadows, which take longer; or either, clip by clip."""
+    backend: Literal["auto", "torch"] = "auto"
+    """What renders the blurred images: auto, compiled where that can be, or torch, as all were before this option."""
     textures: str | None = None
     """Folder of pictures (PNG, JPEG, WebP, BMP) that floors, walls and half of the bodies wear."""
     backgrounds: str | None = None

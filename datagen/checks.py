@@ -1,14 +1,15 @@
 """Checks: is every byte of a data set as it was written, and how far is it.
 
-Before: folders.py, manifest.py, shards.py, entries.py.  After: commands.py.
+Before: folders.py, manifest.py, shards.py, entries.py, report.py, run_log.py.  After: commands.py.
 What is covered: `run.json` and the shards' markers by checksums of their own, every line of `manifest.jsonl` by being
-just what that configuration writes, all else by the checksums in them. Not covered are `contact_sheet.png`, the
-lists of failures and the log of runs.
+just what that configuration writes, the lists of failures and the lines of the log by checksums of their own, the
+contact sheet by those that PNG has, all else by the checksums in the lists.
 """
 
 from __future__ import annotations
 
 import json
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,13 @@ from typing import Any
 from datagen.entries import is_sharded, read_entries
 from datagen.folders import RUN_NAME, encode_run, read_run, record_sum
 from datagen.listed_files import file_damage, is_of_configuration
-from datagen.manifest import MANIFEST_NAME, encode_entry, scan_manifest
+from datagen.manifest import MANIFEST_NAME, ManifestError, encode_entry, scan_manifest
+from datagen.report import SHEET_NAME
+from datagen.run_log import LOG_NAME, read_log
 from datagen.shards import marker_entries, marker_path, scan_shards, shard_damage
 from datagen.spec import DatasetSpec, SpecError, recorded_spec
+
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 @dataclass(frozen=True)
@@ -64,7 +69,7 @@ def verify_dataset(folder: str | Path) -> list[str]:
                 name = marker_path(marker["shard"])
                 problems += [f"{name}: {text}" for entry in entries if (text := _misfit(entry, spec, config))]
             problems += shard_damage(folder, marker["shard"], marker)
-        return [f"{folder}: {problem}" for problem in (*problems, *notes)]
+        return [f"{folder}: {problem}" for problem in (*problems, *notes, *_side_damages(folder))]
     lines, notes = scan_manifest(folder)
     written = set((folder / MANIFEST_NAME).read_bytes().splitlines(keepends=True))
     seen: set[int] = set()
@@ -77,7 +82,7 @@ def verify_dataset(folder: str | Path) -> list[str]:
             )
         seen.add(index)
         problems += [f"frame {index}: {damage}" for file in entry["files"] if (damage := file_damage(folder, file))]
-    return [f"{folder}: {problem}" for problem in (*problems, *notes)]
+    return [f"{folder}: {problem}" for problem in (*problems, *notes, *_side_damages(folder))]
 
 
 def read_status(folder: str | Path) -> Status:
@@ -94,10 +99,54 @@ def read_status(folder: str | Path) -> Status:
     failed: dict[int, str] = {}
     refused: dict[str, str] = {}
     for place in sorted(folder.glob("failures*.json")):
-        lists = json.loads(place.read_text(encoding="utf-8"))
+        lists = _failures(place)
+        if lists is None:
+            raise ManifestError(f"{place}: expected a list of failures, got one that is damaged; the next run mends it")
         failed |= {f["index"]: f["reason"] for f in lists["frames"] if f["index"] not in entries}
         refused |= {f["path"]: f["reason"] for f in lists["assets"]}
     return Status(spec, len(entries), tuple(sorted(failed.items())), tuple(refused.items()))
+
+
+def _side_damages(folder: Path) -> list[str]:
+    """Return what is wrong with the files that tell about a data set; the next whole run writes them anew."""
+    problems = []
+    for place in sorted(folder.glob("failures*.json")):
+        if _failures(place) is None:
+            problems.append(f"{place.name}: expected a list of failures with its checksum, got another")
+    try:
+        if (unread := read_log(folder)[1]) > 0:
+            problems.append(f"{LOG_NAME}: expected lines with their checksums, got {unread} others")
+    except OSError as error:
+        problems.append(f"{LOG_NAME} cannot be read ({error.strerror})")
+    sheet = folder / SHEET_NAME
+    if sheet.exists() and not _is_whole_png(sheet.read_bytes()):
+        problems.append(f"{SHEET_NAME}: expected a PNG with its checksums, got another")
+    return problems
+
+
+def _failures(place: Path) -> dict[str, Any] | None:
+    """Return a list of failures, or none if it is not as written."""
+    try:
+        data = place.read_bytes()
+        lists = json.loads(data)
+        is_whole = lists["record_sha256"] == record_sum(lists) and encode_run(lists) == data
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return None
+    return lists if is_whole else None
+
+
+def _is_whole_png(data: bytes) -> bool:
+    """Tell whether the chunks of a PNG fill it and have the checksums that they say."""
+    place, kind = len(PNG_SIGNATURE), b""
+    if not data.startswith(PNG_SIGNATURE):
+        return False
+    while kind != b"IEND":
+        length = int.from_bytes(data[place : place + 4], "big")
+        body, end = data[place + 4 : place + 8 + length], place + 12 + length
+        if end > len(data) or zlib.crc32(body) != int.from_bytes(data[end - 4 : end], "big"):
+            return False
+        place, kind = end, body[:4]
+    return place == len(data)
 
 
 def _misfit(entry: dict[str, Any], spec: DatasetSpec, config: str) -> str:

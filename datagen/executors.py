@@ -76,8 +76,15 @@ def run_processes(task: Task, plan_json: str, folder: str, indices: Iterable[int
             room = (1 if alone else workers) - len(running)
             queue = suspects if alone else waiting
             while room > 0 and queue:
-                index = queue.popleft()
-                running[pool.submit(attempt, task, plan_json, folder, index)] = index
+                try:
+                    future = pool.submit(attempt, task, plan_json, folder, queue[0])
+                except BrokenProcessPool:  # a process died between two frames: none of them is to blame
+                    if running:
+                        break  # they end with it, below
+                    _end_pool(pool, is_idle=False)
+                    pool = _new_pool(workers)
+                    continue
+                running[future] = queue.popleft()
                 room -= 1
             finished, _ = wait(running, return_when=FIRST_COMPLETED)
             is_broken = False

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -111,21 +111,27 @@ def one_at_a_time(folder: Path) -> Iterator[None]:
 def settle_storage(spec: DatasetSpec, folder: Path) -> DatasetSpec:
     """Return the specification with `auto` storage decided: what the folder has, else by the number of frames.
 
-    Raises:
-        SpecError: the folder's run.json cannot be read.
-
     Source: ours.
     """
     if spec.storage != "auto":
         return spec
     storage = "shards" if spec.count >= SHARDS_FROM else "folder"
     if (folder / RUN_NAME).exists():
-        storage = read_run(folder)["spec"].get("storage", "folder")
+        try:
+            storage = read_run(folder)["spec"].get("storage", "folder")
+        except SpecError:  # what is there tells, too
+            storage = "shards" if (folder / SHARD_FOLDER).is_dir() else "folder"
     return spec.model_copy(update={"storage": storage})
 
 
-def check_run(folder: Path, plan: Plan) -> None:
-    """Raise unless a locked folder is empty or holds what `plan` makes, or less of it.
+def check_run(folder: Path, plan: Plan, is_borne_out: Callable[[], bool | None]) -> list[str]:
+    """Raise unless a locked folder is empty or holds what `plan` makes, or less of it; return what is to be told.
+
+    Args:
+        folder: of the data set.
+        plan: what is to be made.
+        is_borne_out: tells whether all frames that are listed are the plan's, none if there are no frames. It is asked
+            where the record of the run is damaged, and then decides.
 
     Raises:
         SpecError: the folder holds data of another configuration; the fields that differ are named.
@@ -133,14 +139,27 @@ def check_run(folder: Path, plan: Plan) -> None:
     Source: ours.
     """
     if (folder / RUN_NAME).exists():
-        problems = _differences(read_run(folder), _run_record(plan), folder)
-        if problems:
+        try:
+            record = read_run(folder)
+            is_whole = record.get("record_sha256") == record_sum(record)
+            problems = _differences(record, _run_record(plan), folder)
+        except SpecError as error:
+            is_whole, problems = False, error.problems
+        except (TypeError, ValueError):  # values of other types than were written
+            is_whole, problems = False, [f"out: expected a readable {RUN_NAME}, got {str(folder / RUN_NAME)!r} damaged"]
+        if is_whole and problems:
             raise SpecError(problems)
-        return
+        if is_whole:
+            return []
+        borne_out = is_borne_out()
+        if borne_out is False or (borne_out is None and problems):
+            raise SpecError(problems or [f"out: expected frames as {RUN_NAME} has them in {folder}, got others"])
+        return [f"{RUN_NAME}: expected a record with its checksum, got another; written again"]
     strange = sorted(p.name for p in folder.iterdir() if not _is_left_by_a_start(p))
     if strange:  # people's own files are not to be mixed with, still less swept
         found = ", ".join(strange[:3]) + (", …" if len(strange) > 3 else "")
         raise SpecError([f"out: expected an empty folder or a data set with its {RUN_NAME}, got {found}"])
+    return []
 
 
 def write_run(folder: Path, plan: Plan) -> None:
@@ -219,7 +238,7 @@ def _run_record(plan: Plan) -> dict[str, Any]:
 def _differences(found: dict[str, Any], wanted: dict[str, Any], folder: Path) -> list[str]:
     """Return one line for each field in which a folder's data differ from what is asked for."""
     problems = []
-    as_before = {"storage": "folder"} | {name: DatasetSpec.model_fields[name].default for name in ADDED_LATER}
+    as_before = {"storage": "folder"} | ADDED_LATER
     was_spec, now_spec = as_before | found["spec"], wanted["spec"]
     fixed = set(was_spec) | set(now_spec)
     fixed -= set(NOT_IN_THE_BYTES)

@@ -17,11 +17,21 @@ from torch import Tensor
 
 from datagen.clips import Actor
 from datagen.lamps import KINDS, Lamp
-from datagen.motions import Path, Sway, Vector
+from datagen.motions import CameraPath, Path, Sway, Vector
 from datagen.patterns import paint
 from datagen.seeds import open_stream
 from datagen.shapes import Shape, box, sheet
-from datagen.stages import Stage, backdrop_colours, choose_camera, gradient_image, laid, quiet, speed_of, still
+from datagen.stages import (
+    HEADROOM,
+    Stage,
+    backdrop_colours,
+    choose_camera,
+    gradient_image,
+    laid,
+    quiet,
+    speed_of,
+    still,
+)
 
 PLACES = ("floor", "corner", "wall", "room")
 PLACE_WEIGHTS = (0.36, 0.3, 0.14, 0.2)
@@ -71,7 +81,7 @@ def choose_lit_stage(
     floor_y = min(max(lowest_y(cast) - float(rng.uniform(0.05, 0.4)), LOWEST), HIGHEST)
     sky = gradient_image(rng, (main * 1.25).clamp(max=1), second, size)
     actors = []
-    for name, shape, place in _surfaces(kind, floor_y, math.hypot(*camera.eye.start)):
+    for name, shape, place in _surfaces(kind, floor_y, camera):
         pair = torch.stack([main, second] if name != "wall" else [second, main])
         actors.append(still(name, shape, paint(shape, pair, quiet(rng), rng), place, is_lit=True))
     lamps, ambient = choose_lamps(rng, kind, PICTURE_ALBEDO if has_textures else float((main + second).mean() / 2))
@@ -117,7 +127,7 @@ def lowest_y(cast: Sequence[Actor]) -> float:
     return min(lowest, default=0.0)
 
 
-def _surfaces(kind: str, floor_y: float, distance: float) -> list[tuple[str, Shape, Vector]]:
+def _surfaces(kind: str, floor_y: float, camera: CameraPath) -> list[tuple[str, Shape, Vector]]:
     """Return name, shape and place of what shadows fall on."""
     floor = laid(sheet(20, 0.0, 1.0)).scaled((11.0, 1.0, 11.0))
     wall = sheet(20, 0.0, 0.7).scaled((12.0, 12.0, 1.0))
@@ -128,7 +138,8 @@ def _surfaces(kind: str, floor_y: float, distance: float) -> list[tuple[str, Sha
     if kind == "corner":  # the floor ends at the wall, which stands on it
         half_height = 0.7 * 12.0
         return [("floor", floor, (0.0, floor_y, WALL_Z + 11.0)), ("wall", wall, (0.0, floor_y + half_height, WALL_Z))]
-    half = (3.4 + 0.5 * distance, 3.9, 1.4 + distance)
+    distance = math.hypot(*camera.eye.start)
+    half = (3.4 + 0.5 * distance, max(3.9, (camera.highest_y + HEADROOM - floor_y) / 2), 1.4 + distance)
     shape = box(8, half)
     return [("room", Shape(shape.vertices, shape.faces.flip(1), shape.cell_uv, True), (0.0, floor_y + half[1], 0.0))]
 

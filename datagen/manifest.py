@@ -53,8 +53,9 @@ def begin_run(folder: Path, plan: Plan) -> Holdings:
 
     Source: ours.
     """
-    check_run(folder, plan)
     lines, notes = scan_manifest(folder) if (folder / MANIFEST_NAME).exists() else ([], [])
+    ours = [e["config_sha256"] == plan.config_sha256 and e["index"] < plan.spec.count for e in lines]
+    notes = check_run(folder, plan, lambda: all(ours) if ours else None) + notes
     found = {entry["config_sha256"] for entry in lines}
     if found and plan.config_sha256 not in found:  # among fitting ones, a line that does not fit is a damaged line
         wanted_sum = plan.config_sha256

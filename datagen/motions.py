@@ -187,6 +187,11 @@ class CameraPath:
         rolls = self.roll_rad != 0 and self.roll_rate_rad_s != 0
         return self.eye.is_static and self.target.is_static and self.orbit_rad_s == 0 and not rolls
 
+    @property
+    def highest_y(self) -> float:
+        """A height that the eye never passes [scene units], if its path only sways."""
+        return self.eye.start[1] + sum(abs(sway.direction[1]) for sway in self.eye.sways)
+
     def matrices(self, times_s: Tensor, width: int, height: int) -> Tensor:
         """Return (N, 4, 4) float64 world-to-clip matrices at times (N,) [s] for an image of that size [px].
 

@@ -1,12 +1,14 @@
 """Run log: how long the runs of a data set took, for its report; no byte of a frame depends on it.
 
-Before: nothing.  After: runs.py writes it, pages.py reads it.
+Before: writer.py.  After: runs.py writes it, pages.py and checks.py read it.
 `.runs.log` has one line of JSON for each run that made or failed to make a frame; a run that was killed has none.
-Slices append to the same file, a line in one write.
+Slices append to the same file, a line in one write. Each line has its checksum; a run of the whole set drops those
+that were damaged.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -16,6 +18,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
+
+from datagen.writer import write_atomically
 
 LOG_NAME = ".runs.log"
 
@@ -50,6 +55,8 @@ def logged_run(folder: Path, workers: int, part: str) -> Iterator[RunNote]:
 
     Source: ours.
     """
+    if not part:
+        _drop_damaged_lines(folder)
     note = RunNote(time.time(), 0.0, 0, 0, workers, part)
     start = time.monotonic()
     try:
@@ -57,7 +64,7 @@ def logged_run(folder: Path, workers: int, part: str) -> Iterator[RunNote]:
     finally:
         note.seconds = time.monotonic() - start
         if note.made or note.failed:
-            line = json.dumps(asdict(note), sort_keys=True).encode() + b"\n"
+            line = encode_line(asdict(note))
             try:
                 descriptor = os.open(folder / LOG_NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
                 try:
@@ -80,14 +87,34 @@ def read_log(folder: str | Path) -> tuple[list[RunNote], int]:
     notes, unread = [], 0
     for line in lines:
         try:
-            note = RunNote(**json.loads(line))
+            fields = json.loads(line)
+            del fields["line_sha256"]
+            note, is_written = RunNote(**fields), encode_line(fields) == line + b"\n"
             numbers = (note.started_s, note.seconds, note.made, note.failed, note.workers)
-            is_valid = all(isinstance(n, (int, float)) and math.isfinite(n) and n >= 0 for n in numbers)
+            is_valid = is_written and all(isinstance(n, (int, float)) and math.isfinite(n) and n >= 0 for n in numbers)
             is_valid = is_valid and isinstance(note.part, str)
-        except (ValueError, TypeError, RecursionError):
+        except (ValueError, TypeError, KeyError, RecursionError):
             is_valid = False
         if is_valid:
             notes.append(note)
         else:
             unread += 1
     return notes, unread
+
+
+def encode_line(fields: dict[str, Any]) -> bytes:
+    """Return a note's fields as its line of the log, with its checksum. Source: ours."""
+    text = json.dumps(fields, sort_keys=True)
+    return (
+        json.dumps(fields | {"line_sha256": hashlib.sha256(text.encode()).hexdigest()}, sort_keys=True).encode() + b"\n"
+    )
+
+
+def _drop_damaged_lines(folder: Path) -> None:
+    """Write the log anew if lines of it cannot be read."""
+    try:
+        notes, unread = read_log(folder)
+        if unread:
+            write_atomically(folder / LOG_NAME, b"".join(encode_line(asdict(note)) for note in notes))
+    except OSError as error:
+        print(f"{folder / LOG_NAME}: expected a log that can be mended, got {error.strerror}", file=sys.stderr)

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.executors import Outcome, Task, run_processes, run_serial
-from datagen.folders import Slice, locked_folder, settle_storage
+from datagen.folders import Slice, encode_run, locked_folder, record_sum, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
 from datagen.progress import Progress
 from datagen.ray_executor import check_ray, run_ray
@@ -195,4 +195,4 @@ def _write_failures(
         "frames": [{"index": i, "reason": r} for i, r in failed],
         "assets": [{"path": p, "reason": r} for p, r in refused],
     }
-    write_atomically(place, (json.dumps(lists, indent=1) + "\n").encode())
+    write_atomically(place, encode_run(lists | {"record_sha256": record_sum(lists)}))

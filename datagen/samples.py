@@ -113,7 +113,7 @@ def render_sample(clip: Clip, plan: Plan, index: int, frame: int) -> Sample:
     spec, times = plan.spec, frame_times(plan, frame)
     size = (spec.width, spec.height)
     exposure = expose(clip, *size, times.open_s, times.close_s)
-    blurred = tb.render(exposure.scene, rays_per_pixel=spec.rays_per_pixel)
+    blurred = tb.render(exposure.scene, rays_per_pixel=spec.rays_per_pixel, backend=spec.backend)
     now = tb.render_instant(exposure.scene, t=0.5, rays_per_pixel=spec.rays_per_pixel)
     baselines, settings = filter_instant(exposure.scene, now, spec.baseline_names)
     return Sample(
@@ -170,6 +170,7 @@ def _metadata(clip: Clip, exposure: Exposure, plan: Plan, index: int, times: Fra
             "next": times.next_s,
         },
         "rays_per_pixel": spec.rays_per_pixel,
+        "backend": spec.backend,
         "camera": {
             "world_to_clip": scene.camera.world_to_clip.reshape(-1, 4, 4).tolist(),
             "near": clip.camera.near,

@@ -77,7 +77,7 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
     """
     numbers = run_shards(plan.spec, part)
     with one_at_a_time(folder):
-        check_run(folder, plan)
+        notes = check_run(folder, plan, lambda: _bear_out(folder, plan))
         (folder / SHARD_FOLDER).mkdir(exist_ok=True)
         if part is None:
             sweep((folder, folder / SHARD_FOLDER))
@@ -87,7 +87,6 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
         write_run(folder, plan)
     entries: dict[int, dict[str, Any]] = {}
     damaged: dict[int, str] = {}
-    notes = []
     for number in numbers:
         if not (folder / marker_path(number)).exists():
             continue
@@ -236,6 +235,18 @@ def shard_damage(folder: Path, number: int, marker: dict[str, Any]) -> list[str]
     files = [file for entry in marker_entries(marker) for file in entry["files"]]
     damages = [damage for damage in (file_damage(folder, file) for file in files) if damage]
     return damages or [f"{tar_path(number)} differs from its marker between its files"]
+
+
+def _bear_out(folder: Path, plan: Plan) -> bool | None:
+    """Tell whether all frames that are listed are in the shards where a plan puts them; none if there are no frames."""
+    markers, _ = scan_shards(folder)
+    if not markers:
+        return None
+    return all(
+        marker["config_sha256"] == plan.config_sha256
+        and all(frame["index"] in shard_frames(plan.spec, marker["shard"]) for frame in marker["frames"])
+        for marker in markers
+    )
 
 
 class _EveryFrameFailed(Exception):

@@ -24,7 +24,8 @@ SEQUENCE_SUFFIXES = (".npz", ".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".
 BASELINES = ("directional", "mcguire2012", "guertin2014", "guertin2015")  # in baselines/filters.py, which needs torch
 # A longer run extends a shorter one; a folder's place is not its content; storage does not change a frame's files.
 NOT_IN_THE_BYTES = ("count", "assets", "textures", "backgrounds", "storage", "frames_per_shard")
-ADDED_LATER = ("lighting",)  # fields whose default means what data sets were before these fields: they stay the same
+# Fields that came later, with what data sets were before: with that value they stay the same.
+ADDED_LATER = {"lighting": "painted", "backend": "torch"}
 
 
 class SpecError(ValueError):
@@ -51,6 +52,8 @@ class DatasetSpec(BaseModel):
         sequence_fps: at what rate the frames of a sequence are played [Hz]; an animated file has its own times.
         lighting: `painted` (a fixed light is painted into colours), `lamps` (moving lamps light the clips, which have
             a floor or walls for their shadows) or `mixed`: one or the other, clip by clip.
+        backend: what renders the blurred images: `auto` (compiled where that can be, else torch) or `torch`; see
+            `torchblur.render`. They may differ in the last bits.
         textures: a folder of pictures that floors, walls and half of the bodies wear.
         backgrounds: a folder of pictures of which one is behind each clip, instead of walls and skies.
         baselines: filters whose images are stored beside the exact one: names from BASELINES, between commas.
@@ -82,6 +85,7 @@ class DatasetSpec(BaseModel):
     rays_per_pixel: int = Field(default=4, ge=1, le=4096)
     sequence_fps: float = Field(default=24.0, gt=0, le=1e6, allow_inf_nan=False)
     lighting: Literal["painted", "lamps", "mixed"] = "painted"
+    backend: Literal["auto", "torch"] = "auto"
     textures: str | None = None
     backgrounds: str | None = None
     storage: Literal["auto", "folder", "shards"] = "auto"
@@ -163,7 +167,7 @@ class DatasetSpec(BaseModel):
 
         Source: ours.
         """
-        left_out = {k for k in ADDED_LATER if getattr(self, k) == type(self).model_fields[k].default}
+        left_out = {name for name, before in ADDED_LATER.items() if getattr(self, name) == before}
         fields = {k: v for k, v in self.model_dump().items() if k not in left_out.union(NOT_IN_THE_BYTES)}
         text = json.dumps(fields | {"assets_sha256": assets_sha256}, sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()

@@ -22,6 +22,7 @@ from datagen.patterns import lit_color, paint, smooth_noise
 from datagen.shapes import Shape, box, sheet
 
 VIEW_HEIGHT = 4.0  # [scene units] seen at the origin, from top to bottom
+HEADROOM = 0.5  # [scene units] from the eye to the ceiling, at least; matters to tall images, whose eye is far away
 REFERENCE_S = 1 / 48  # half of a frame time at 24 fps: a cinema camera's usual exposure
 CAMERA_KINDS = ("still", "truck", "dolly", "orbit", "pan", "shake")
 CAMERA_WEIGHTS = (0.18, 0.18, 0.16, 0.18, 0.14, 0.16)
@@ -125,7 +126,7 @@ def choose_stage(
     sky = gradient_image(rng, (main * 1.25).clamp(max=1), second, size)
     actors: tuple[Actor, ...] = ()
     if kind == "room":
-        half = (3.4 + 0.5 * distance, 3.1, 1.4 + distance)
+        half = (3.4 + 0.5 * distance, max(3.1, camera.highest_y + HEADROOM), 1.4 + distance)
         shape = box(10, half)
         inside = Shape(shape.vertices, shape.faces.flip(1), shape.cell_uv, True)
         actors = (still("room", inside, paint(inside, pair, quiet(rng), rng)),)

@@ -16,23 +16,27 @@ FLIPS = 100
 @pytest.fixture(scope="module", params=["folder", "shards"])
 def folder(request, tmp_path_factory):
     out = tmp_path_factory.mktemp(request.param) / "data"
-    assert generate(parse_spec(TINY | {"storage": request.param, "frames_per_shard": 3}), out).is_complete
+    fields, real = TINY | {"storage": request.param, "frames_per_shard": 3}, datagen.runs.make_sample
+    assert generate(parse_spec(fields), out).is_complete
+    with pytest.MonkeyPatch.context() as patch:  # one more frame fails, so that there is a list of failures too
+        patch.setattr(datagen.runs, "make_sample", lambda plan, i: 1 / 0 if i == 5 else real(plan, i))
+        assert generate(parse_spec(fields | {"count": 6}), out).failed == ((5, "ZeroDivisionError: division by zero"),)
     return out
 
 
 def covered_files(folder):
-    """What verify answers for: all that is needed to use the data."""
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith((".lock", LOG_NAME))]
-    return sorted(p for p in files if p.name != "contact_sheet.png")
+    """What verify answers for: all that a run writes; the locks are empty."""
+    return sorted(p for p in folder.rglob("*") if p.is_file() and p.stat().st_size)
 
 
 def test_every_flipped_bit_is_found_and_its_file_named(folder):
     assert verify_dataset(folder) == []
     files = covered_files(folder)
     rng = np.random.default_rng(0)
-    small = [p for p in files if p.suffix in (".json", ".jsonl")]
+    small = [p for p in files if p.name in ("contact_sheet.png", LOG_NAME) or p.suffix in (".json", ".jsonl")]
+    assert {LOG_NAME, "run.json", "failures.json", "contact_sheet.png"} < {p.name for p in small}
     for number in range(FLIPS):
-        path = small[number % len(small)] if number % 2 else files[int(rng.integers(len(files)))]
+        path = small[number // 2 % len(small)] if number % 2 else files[int(rng.integers(len(files)))]
         data = path.read_bytes()
         broken = bytearray(data)
         broken[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))

@@ -3,6 +3,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,23 @@ def test_a_frame_that_kills_its_process_is_given_up_and_the_others_are_made(tmp_
     assert len(list(tmp_path.iterdir())) == MAX_TRIES
     with pytest.raises(ValueError, match="workers: expected"):
         list(run_processes(task_that_dies_at_1, "", "", range(1), 0))
+
+
+def task_that_tells_who(plan_json, folder, index):
+    return str(os.getpid())
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_a_process_that_dies_between_frames_costs_none(workers):
+    outcomes = []
+    for outcome in run_processes(task_that_tells_who, "", "", range(6), workers):
+        outcomes.append(outcome)
+        if outcome.index in (1, 3):
+            os.kill(int(outcome.text), signal.SIGKILL)  # it is idle now: the next frame is handed out after this
+            time.sleep(1.0)  # until the pool knows
+    assert sorted(o.index for o in outcomes) == list(range(6))
+    assert [o.error for o in outcomes] == [""] * 6
+    assert len({o.text for o in outcomes}) > workers
 
 
 def test_a_worker_watches_over_its_driver_before_it_imports_torch():

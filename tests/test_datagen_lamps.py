@@ -11,7 +11,7 @@ from PIL import Image
 from torch.utils.data import DataLoader
 
 import torchblur as tb
-from datagen import BlurDataset, generate, parse_spec, verify_dataset
+from datagen import BlurDataset, SpecError, generate, parse_spec, verify_dataset
 from datagen.__main__ import main
 from datagen.clips import Actor, Clip, expose
 from datagen.entries import read_entries
@@ -192,8 +192,9 @@ def test_lit_pictures_are_neither_black_nor_burnt_out_and_most_have_shadows():
 
 def test_painted_data_sets_are_what_they_were_before_there_were_lamps():
     # measured before the field existed: a data set that was begun then can be finished now
-    assert parse_spec({}).config_sha256() == "94523107d4c2d25d7e6cd49fd7d75e2473cb693fe4629e8911efeb23f1a9f56c"
-    other = parse_spec({"sensor": "srgb", "seed": 4}).config_sha256("ab")
+    before = {"backend": "torch"}  # as all were made
+    assert parse_spec(before).config_sha256() == "94523107d4c2d25d7e6cd49fd7d75e2473cb693fe4629e8911efeb23f1a9f56c"
+    other = parse_spec(before | {"sensor": "srgb", "seed": 4}).config_sha256("ab")
     assert other == "0578906625ff1b49cfc6770b07881c8f5be452a5e80c589fa61053ccc878fa48"
     assert len({parse_spec({"lighting": k}).config_sha256() for k in ("painted", "lamps", "mixed")}) == 3
     clip = build_clip(plan(seed=3), 5)
@@ -315,13 +316,16 @@ def test_lamps_light_peoples_meshes_and_sequences_too(tmp_path, source):
 def test_lighting_is_refused_by_name_and_is_part_of_the_configuration(tmp_path, capsys):
     assert main(["--out", str(tmp_path / "none"), "--lighting", "sun"]) == 2
     assert "lighting" in capsys.readouterr().err
-    generate(parse_spec(TINY | {"count": 1}), tmp_path / "data")
+    generate(parse_spec(TINY | {"count": 1, "backend": "torch"}), tmp_path / "data")
     assert main(["--out", str(tmp_path / "data"), "--lighting", "lamps", *_words(TINY | {"count": 1})]) == 2
     assert "lighting: expected 'painted'" in capsys.readouterr().err
     run = json.loads((tmp_path / "data/run.json").read_text())
-    del run["spec"]["lighting"]  # as it was before the field existed
+    for name in ("lighting", "backend"):  # as it was before the fields existed
+        del run["spec"][name]
     (tmp_path / "data/run.json").write_text(json.dumps(run))
-    result = generate(parse_spec(TINY | {"count": 1}), tmp_path / "data")
+    with pytest.raises(SpecError, match="backend: expected 'torch'"):
+        generate(parse_spec(TINY | {"count": 1}), tmp_path / "data")
+    result = generate(parse_spec(TINY | {"count": 1, "backend": "torch"}), tmp_path / "data")
     assert (result.made, result.kept) == (0, 1)
 
 

@@ -8,7 +8,7 @@ import datagen.runs
 from datagen import generate, parse_spec, verify_dataset
 from datagen.__main__ import main
 from datagen.pages import RUNS_SHOWN, write_page
-from datagen.run_log import LOG_NAME, RunNote, logged_run, read_log
+from datagen.run_log import LOG_NAME, RunNote, encode_line, logged_run, read_log
 
 TINY = {"width": 8, "height": 6, "rays_per_pixel": 1, "seed": 4}
 
@@ -59,15 +59,20 @@ def test_lines_that_cannot_be_read_are_counted_and_told(tmp_path):
     folder = tmp_path / "data"
     generate(parse_spec(TINY | {"count": 1}), folder)
     good = json.loads((folder / LOG_NAME).read_text())
-    bad = [b"{", b"[]", b"\xff", json.dumps(good | {"seconds": -1}).encode(), json.dumps(good | {"x": 1}).encode()]
-    bad.append(json.dumps(good | {"part": "<b>", "seconds": float("nan")}).encode())
+    assert good.pop("line_sha256") in (folder / LOG_NAME).read_text()
+    more = [{"seconds": -1}, {"x": 1}, {"part": "<b>", "seconds": float("nan")}]
+    bad = [b"{", b"[]", b"\xff", json.dumps(good).encode(), *(encode_line(good | m).strip() for m in more)]
     with (folder / LOG_NAME).open("ab") as file:
-        file.write(b"\n".join(bad) + b"\n" + json.dumps(good | {"part": "<b>"}).encode() + b"\n")
+        file.write(b"\n".join(bad) + b"\n" + encode_line(good | {"part": "<b>"}))
     notes, unread = read_log(folder)
     assert (len(notes), unread) == (2, len(bad))
     text = write_page(folder, tmp_path / "report.html").read_text()
     assert f"{len(bad)} lines of the log of runs cannot be read" in text
     assert "<td>&lt;b&gt;</td>" in text
+    assert any(LOG_NAME in problem for problem in verify_dataset(folder))
+    generate(parse_spec(TINY | {"count": 1}), folder)  # drops them
+    assert verify_dataset(folder) == []
+    assert (len(read_log(folder)[0]), read_log(folder)[1]) == (2, 0)
     (folder / LOG_NAME).unlink()
     assert "Throughput" not in write_page(folder, tmp_path / "report.html").read_text()
 

@@ -463,3 +463,36 @@ def test_a_path_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(SpecError, match="out: expected a folder"):
         generate(spec(), tmp_path / "file")
+
+
+@pytest.mark.parametrize("storage", ["folder", "shards"])
+def test_a_damaged_record_of_the_run_is_written_again_where_the_frames_bear_it_out(tmp_path, storage):
+    fields = {"storage": storage, "frames_per_shard": 2}
+    folder = tmp_path / "data"
+    generate(spec(**fields), folder)
+    whole = sums(folder)
+    record = (folder / "run.json").read_bytes()
+    damages = (
+        b"",
+        record[:-9],
+        record.replace(b'"seed": 4', b'"seed": 5'),
+        record.replace(b'"count": 4', b'"count": ""'),
+    )
+    for damaged in damages:
+        assert damaged != record
+        (folder / "run.json").write_bytes(damaged)
+        assert verify_dataset(folder) != []
+        for other in ({"seed": 5}, {"count": 2}):
+            with pytest.raises(SpecError):
+                generate(spec(**fields | other), folder)
+            assert (folder / "run.json").read_bytes() == damaged
+        result = generate(spec(**fields | {"storage": "auto"}), folder)
+        assert (result.made, result.kept) == (0, 4)
+        assert "run.json" in result.repaired[0]
+        assert sums(folder) == whole
+        assert verify_dataset(folder) == []
+    (folder / "run.json").write_bytes(b"")
+    for place in (*folder.glob("manifest.jsonl"), *folder.glob("shards/*.json")):
+        place.unlink()
+    with pytest.raises(SpecError, match=r"run\.json"):  # nothing bears it out
+        generate(spec(**fields), folder)

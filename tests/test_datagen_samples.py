@@ -4,6 +4,7 @@ import math
 import pytest
 import torch
 
+import torchblur as tb
 from datagen.clips import Actor, Clip
 from datagen.motions import CameraPath, Path, RigidBody, RigidMotion, Sway
 from datagen.samples import frame_times, make_sample, render_sample
@@ -47,6 +48,15 @@ def test_a_square_moving_right_and_down_has_positive_motion():
     assert data["forward.u"][SIZE // 2, SIZE // 2] == pytest.approx(12 * PX / 48, abs=1e-3)
     assert data["forward.v"][SIZE // 2, SIZE // 2] == pytest.approx(6 * PX / 48, abs=1e-3)
     assert data["previous.u"][SIZE // 2, SIZE // 2] < 0 < data["next.v"][SIZE // 2, SIZE // 2]
+
+
+def test_the_backend_is_what_renders_and_is_told_of(monkeypatch):
+    seen, render = [], tb.render
+    monkeypatch.setattr(tb, "render", lambda scene, **how: seen.append(how["backend"]) or render(scene, **how))
+    clip = square_clip((12.0, -6.0, 0.0))
+    auto, plain = (render_sample(clip, plan(**more), 0, 0) for more in ({}, {"backend": "torch"}))
+    assert seen == ["auto", "torch"] == [sample.meta["backend"] for sample in (auto, plain)]
+    torch.testing.assert_close(auto.blurred, plain.blurred, atol=2e-5, rtol=0)
 
 
 def test_curved_motion_to_the_neighbours_is_that_of_their_sharp_instants():

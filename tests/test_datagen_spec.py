@@ -88,7 +88,8 @@ def test_a_specification_cannot_be_changed():
 def test_the_hash_leaves_out_count_storage_and_the_place_of_assets_only(tmp_path):
     base = parse_spec({})
     changed = {"width": 8, "height": 8, "seed": 1, "frames_per_clip": 2, "fps": 25.0, "exposure": 1.0,
-               "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015", "lighting": "mixed"}  # fmt: skip
+               "rays_per_pixel": 1, "sequence_fps": 12.0, "baselines": "guertin2015", "lighting": "mixed",
+               "backend": "torch"}  # fmt: skip
     cameras = [{"sensor": "gamma"}, {"sensor": "gamma", "sensor_gain": 2.0}]
     assert len({parse_spec(c).config_sha256() for c in (*cameras, {})}) == 3
     hashes = {parse_spec({k: v}).config_sha256() for k, v in changed.items()} | {base.config_sha256()}

@@ -6,6 +6,8 @@ Source: ours.
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import logging
 from collections.abc import Callable
@@ -73,7 +75,20 @@ def _compiled(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:
     # Numba asks only whether the function's own file has changed, not those of the functions that it calls
     stored = compiled._cache._cache_file
     stored._source_stamp = (stored._source_stamp, DIGEST)
+    stored.save = functools.partial(_save, stored)
     return compiled
+
+
+def _save(stored: Any, key: Any, data: Any) -> None:
+    """Store what was compiled for a signature under that signature's own name, and only then list it.
+
+    Numba takes the next free number: of two processes that compile at once, one may list what the other has written
+    for another signature. Here the worst is that an entry is lost from the list, and compiled again.
+    """
+    name = f"{Path(stored._index_name).stem}.{hashlib.sha256(repr(key).encode()).hexdigest()[:16]}.nbc"
+    with contextlib.suppress(OSError):  # a full disk costs time, nothing else
+        stored._save_data(name, data)
+        stored._save_index(stored._load_index() | {key: name})
 
 
 def announce(function: Callable[..., Any]) -> None:

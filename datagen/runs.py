@@ -1,6 +1,6 @@
 """Runs: from a specification to a finished folder, however often it is interrupted.
 
-Before: samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py, run_log.py.
+Before: ahead.py, samples.py, sensor.py, manifest.py, shards.py, executors.py, ray_executor.py, report.py, run_log.py.
 After: commands.py.
 A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSON.
 """
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from datagen.ahead import compile_ahead
 from datagen.executors import Outcome, Task, run_processes, run_serial
 from datagen.folders import Slice, encode_run, locked_folder, record_sum, settle_storage
 from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
@@ -100,6 +101,8 @@ def generate(
                 progress.say(line)
             text = plan.to_json()
             processes = min(max(workers, 1), max(len(run.todo), 1))
+            if processes > 1 and spec.backend == "auto":
+                compile_ahead()
             if executor == "ray":
                 outcomes = run_ray(run.task, text, str(folder), run.todo, processes)
             elif workers <= 1:

@@ -80,6 +80,7 @@ TORCHBLUR = [
     "ledger",
     "exposure",
     "render",
+    "ops",
 ]
 DOORS = {  # third-party package: the only files that may import it (stems; "*" = all of the package)
     "torch": {"torchblur": "*", "datagen": "*"},

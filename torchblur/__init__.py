@@ -7,6 +7,7 @@ from torchblur.instant import Instant, motion_to, render_instant
 from torchblur.lights import DirectionalLight, PointLight, SpotLight
 from torchblur.material import Material
 from torchblur.metrics import flip_hdr, flip_ldr, psnr, ssim
+from torchblur.ops import render_meshes
 from torchblur.render import Frame, render, render_windows
 from torchblur.sampling import Accumulated, accumulate, stochastic
 from torchblur.scene import Mesh, Scene
@@ -37,6 +38,7 @@ __all__ = [
     "psnr",
     "render",
     "render_instant",
+    "render_meshes",
     "render_windows",
     "ssim",
     "stochastic",

@@ -316,6 +316,16 @@ def test_timings_and_counts_name_what_was_done():
     assert all(seconds > 0 for stage, seconds in frame.timings.items() if stage != "shadows")
 
 
+def test_effects_are_timed_where_they_have_code_of_their_own():
+    frames = {name: tb.render(truth_scene(name)[0]) for name in ("a texture that moves", "a sheet that moves")}
+    textured, plain = (frame.effect_timings for frame in frames.values())
+    assert list(textured) == ["texture", "lighting", "shadows", "crossings", "curvature"]
+    assert textured["texture"] > 0
+    assert textured["shadows"] < 1e-3
+    assert plain["curvature"] < 1e-3
+    assert all(sum(f.effect_timings.values()) < sum(f.timings.values()) for f in frames.values())
+
+
 def test_bad_plans_are_refused():
     scene, _ = truth_scene("depths that pass")
     plain = tb.plan_effects(truth_scene("a sheet at rest")[0])

@@ -20,6 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 TORCHBLUR = [
     "check",
     "packed",
+    "stopwatch",
     "cpu.jit",
     "shutter",
     "accuracy",

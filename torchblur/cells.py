@@ -19,6 +19,7 @@ from torchblur import bernstein, packed
 from torchblur.intervals import Intervals, attach_gradient, nearness_at
 from torchblur.prisms import Prisms
 from torchblur.sort import argsort_by, argsort_descending_in, inverse, is_tied, reorder_ties
+from torchblur.stopwatch import spent_on
 
 CROSSING_NOISE = 1e-12  # of the largest product: smaller coefficients of F are rounding
 MIN_CELL = 1e-12  # of the window: shorter cells are not searched for crossings; a pixel changes by at most as much
@@ -93,7 +94,8 @@ def cut_cells(prisms: Prisms, intervals: Intervals, may_cross: bool = True) -> C
     layers = _stack_layers(prisms, intervals, None)
     if not may_cross:
         return _pack(intervals, layers, 0)
-    crossings = found = _find_crossings(prisms, intervals, layers)
+    with spent_on("crossings"):
+        crossings = found = _find_crossings(prisms, intervals, layers)
     if len(crossings.pixel) == 0:
         return _pack(intervals, layers, 0)
     while len(found.pixel):
@@ -101,7 +103,8 @@ def cut_cells(prisms: Prisms, intervals: Intervals, may_cross: bool = True) -> C
         with torch.no_grad():
             pending = intervals.of_pixels(pixels)
             layers = _stack_layers(prisms, pending, _of_pixels(crossings, pixels))
-        found = _find_crossings(prisms, pending, layers)
+        with spent_on("crossings"):
+            found = _find_crossings(prisms, pending, layers)
         own, _ = packed.select(intervals.offsets, pixels)
         found = Crossings(pixels[found.pixel], found.t, own[found.pair])
         crossings = _join(crossings, found)

@@ -28,6 +28,7 @@ from torchblur.prisms import Prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
+from torchblur.stopwatch import spent_on
 from torchblur.subdivide import approximate
 from torchblur.surfaces import Surfaces
 from torchblur.survey import Survey
@@ -117,14 +118,16 @@ class Exposure:
                 if is_exact:
                     yield place, listing.intervals, listing.cells
                     continue
-                intervals = approximate(work.prisms, listing.intervals, accuracy)
+                with spent_on("curvature"):
+                    intervals = approximate(work.prisms, listing.intervals, accuracy)
                 for pixels in self._chunks(work.prisms.surfaces, intervals):
                     yield (place[0][pixels], place[1][pixels]), intervals.of_pixels(pixels), None
         whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
         for block, candidates in self._blocks(work.prisms, whole, work.chosen):
             with self.ledger.stage("intervals", self.scene.device):
                 intervals, counts = find_visible_intervals(work.prisms, work.survey, block, candidates)
-                intervals = approximate(work.prisms, intervals, accuracy)
+                with spent_on("curvature"):
+                    intervals = approximate(work.prisms, intervals, accuracy)
             self.ledger.add("blocks", 1)
             self.ledger.add_many(counts | {"intervals": intervals.count})
             if intervals.count == 0:

@@ -16,6 +16,7 @@ from torchblur.shadows import Shadows
 
 COUNTS = ("prisms", "blocks", "pairs", "still_pairs", "hidden_pairs", "intervals", "cells", "layers", "crossings")
 COUNTS += ("nodes", "deepest_pixel", "shadow_pairs", "shadow_ranges", "shadow_bytes", "deepest_shadow")
+TIMED_EFFECTS = ("texture", "lighting", "shadows", "crossings", "curvature")  # that have code of their own
 STAGES = ("prisms", "plan", "intervals", "cells", "nodes", "shadows", "resolve")
 
 

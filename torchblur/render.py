@@ -18,10 +18,11 @@ from torchblur.backends import choose_backend
 from torchblur.camera import MAX_RAYS, pixel_rays
 from torchblur.effects import EffectPlan, agree_plan, check_effects, follow_plan, plan_prisms
 from torchblur.exposure import N_LOOKS, Exposure, Work
-from torchblur.ledger import Ledger
+from torchblur.ledger import TIMED_EFFECTS, Ledger
 from torchblur.prisms import build_prisms
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
+from torchblur.stopwatch import watching
 from torchblur.surfaces import build_surfaces
 from torchblur.survey import survey_prisms
 
@@ -40,6 +41,8 @@ class Frame:
     # none is due; None where no light of the scene casts shadows
     counts: dict[str, int]  # how many of ledger.COUNTS
     timings: dict[str, float]  # seconds in each of ledger.STAGES
+    effect_timings: dict[str, float]  # seconds of them in code that serves one of ledger.TIMED_EFFECTS alone; the
+    # others share theirs, and the compiled path does not tell crossings from the rest
     plan: EffectPlan  # which effects were simulated, and why
 
 
@@ -176,6 +179,15 @@ class _Job:
 
     def frames(self) -> list[Frame]:
         """Return a frame for each shutter."""
+        with watching() as watch:
+            images, plan = self._images()
+        casts = any(light.casts_shadows for light in self.scene.lights)
+        spent = {name: watch.seconds.get(name, 0.0) for name in TIMED_EFFECTS}
+        with torch.set_grad_enabled(self.scene.requires_grad):
+            return [self._frame(image, (plan, spent), casts) for image in images]
+
+    def _images(self) -> tuple[Tensor, EffectPlan]:
+        """Return (shutters, H, W, N_LOOKS + M) looks and coverage, and the plan that was followed."""
         scene, ledger = self.scene, self.ledger
         spans = [s.span(s.n_lines(scene.camera.width, scene.camera.height)) for s in self.shutters]
         window = min(start for start, _ in spans), max(end for _, end in spans)
@@ -192,10 +204,9 @@ class _Job:
             work = Work(plan, prisms, survey, chosen)
             exposure = Exposure(scene, self.shutters, self.accuracy, self.memory_bytes, ledger, work, self.backend)
             total = sum(exposure.image(ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
-            casts = any(light.casts_shadows for light in scene.lights)
-            return [self._frame(image, plan, casts) for image in total]
+            return total, plan
 
-    def _frame(self, image: Tensor, plan: EffectPlan, has_shadows: bool) -> Frame:
+    def _frame(self, image: Tensor, done: tuple[EffectPlan, dict[str, float]], has_shadows: bool) -> Frame:
         """Return the frame of (H, W, N_LOOKS + M) looks and coverage."""
         scene = self.scene
         rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., N_LOOKS:]
@@ -205,4 +216,5 @@ class _Job:
         for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
         shadow = shadow if has_shadows else None
-        return Frame(rgba, coverage.to(scene.dtype), shadow, self.ledger.counts, self.ledger.timings, plan)
+        plan, spent = done
+        return Frame(rgba, coverage.to(scene.dtype), shadow, self.ledger.counts, self.ledger.timings, spent, plan)

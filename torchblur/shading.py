@@ -16,6 +16,7 @@ from torchblur import edges
 from torchblur.intervals import Intervals
 from torchblur.lighting import flat_normal, reflected
 from torchblur.prisms import Prisms
+from torchblur.stopwatch import spent_on
 from torchblur.surfaces import Surfaces
 from torchblur.texture import lookup, mip_level
 
@@ -73,9 +74,10 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> Loo
         of, own = which[textured], points.face[textured]
         corner_uv = points.uv[..., textured]
         level = torch.zeros(len(of), dtype=torch.float64, device=of.device)
-        if points.slope.shape[-1]:
-            level = mip_level(surfaces, own, uv_slopes(points, textured))
-        rgba = lookup(surfaces, own, (points.weight[:, textured] * corner_uv).sum(1), level)
+        with spent_on("texture"):
+            if points.slope.shape[-1]:
+                level = mip_level(surfaces, own, uv_slopes(points, textured))
+            rgba = lookup(surfaces, own, (points.weight[:, textured] * corner_uv).sum(1), level)
         rgb = rgb.index_put((of,), rgb[of] * rgba[:, :3])
         opacity = rgba[:, 3]  # 1 must stay 1 for what is behind to be hidden, but weights add up to 1 - 1e-16
         opacity = opacity + ((1 - opacity) * (opacity > 1 - OPAQUE)).detach()
@@ -83,7 +85,8 @@ def look(surfaces: Surfaces, face: Tensor, which: Tensor, points: Points) -> Loo
     lit = surfaces.is_lit[points.face].nonzero().flatten()
     if len(lit):
         visible = None if points.visible is None else points.visible[:, lit]
-        light, own = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit], visible)
+        with spent_on("lighting"):
+            light, own = reflected(surfaces, *position_and_normal(surfaces, points, lit), points.t[lit], visible)
         rgb = rgb.index_put((which[lit],), rgb[which[lit]] * light)
         direct = direct.index_put((which[lit],), own)
     return Look(rgb, alpha, direct)

@@ -30,11 +30,10 @@ def main() -> None:
     chosen = parser.parse_args()
     torch.set_num_threads(1)
     fields = {"width": chosen.size, "height": chosen.size, "rays_per_pixel": chosen.rays, "seed": chosen.seed}
-    warm_up = {"width": 8, "height": 8, "rays_per_pixel": 1}
     plans = {}
     for lighting in ("painted", "lamps"):
-        make_sample(Plan(parse_spec(warm_up | {"lighting": lighting}), (), "").to_json(), 0)
         plans[lighting] = Plan(parse_spec(fields | {"lighting": lighting}), (), "").to_json()
+        make_sample(plans[lighting], 0)  # compiles
     print(f"{chosen.size} px, {chosen.rays} rays a pixel, torch {torch.__version__}, one thread, CPU time of a sample")
     print(f"{'clip':>4} {'painted':>9} {'lamps':>9} {'ratio':>6}  lit clip")
     ratios, totals = [], {"painted": 0.0, "lamps": 0.0}

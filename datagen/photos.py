@@ -1,32 +1,34 @@
 """Photos: people's picture files as linear light, read with distrust.
 
-Before: pictures.py, colour.py, assets.py (rosters of files).  After: wraps.py, scenes.py.
+Before: pictures.py, colour.py, surveys.py.  After: wraps.py, scenes.py.
 Files are taken as sRGB, whatever profile they carry, the way up that their EXIF note says, the first frame of several.
 """
 
 from __future__ import annotations
 
 import functools
-import hashlib
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from datagen.assets import Roster, file_state, files_under
+from datagen.assets import Roster, file_state
 from datagen.colour import linear_from_srgb
 from datagen.formats import MeshError, check_size, short_reason
 from datagen.pictures import PHOTO_FORMATS, PhotoError, decode_photo, resample
+from datagen.surveys import Kind, survey_folder
 
 PHOTO_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-# Named as refused when met in a folder; any other suffix there is passed over.
 UNREAD_SUFFIXES = (".tif", ".tiff", ".exr", ".hdr", ".gif", ".heic", ".avif", ".svg", ".jp2", ".psd", ".raw", ".dng")
 TEXTURE_PX = 512  # longer textures are made smaller: mip levels and their bends cost memory and time
 
 
 class PictureError(MeshError):
     """A picture file that cannot be used, and why."""
+
+
+PICTURES = Kind("picture", PHOTO_SUFFIXES, PHOTO_SUFFIXES, UNREAD_SUFFIXES, PictureError)
 
 
 def survey_photos(folder: str | Path) -> Roster:
@@ -37,24 +39,12 @@ def survey_photos(folder: str | Path) -> Roster:
 
     Source: ours.
     """
-    names, refused, digest = [], [], hashlib.sha256()
-    for name in files_under(folder):
-        suffix = Path(name).suffix.lower()
-        if suffix in UNREAD_SUFFIXES:
-            refused.append((name, f"expected one of {', '.join(PHOTO_SUFFIXES)}, got a {suffix} file"))
-        if suffix not in PHOTO_SUFFIXES:
-            continue
-        try:
-            pixels = read_photo(Path(folder) / name)
-        except PictureError as error:
-            refused.append((name, error.reason))
-            continue
-        names.append(name)
-        digest.update(name.encode() + b"\0" + str(pixels.shape).encode() + pixels.tobytes())
-    if not names:
-        found = "; ".join(f"{n}: {r}" for n, r in refused) or "no picture file at all"
-        raise PictureError(folder, f"expected at least one usable picture file, got {found}")
-    return Roster(tuple(names), tuple(refused), digest.hexdigest())
+    return survey_folder(folder, PICTURES, _content)
+
+
+def _content(path: Path) -> bytes:
+    pixels = read_photo(path)
+    return str(pixels.shape).encode() + pixels.tobytes()
 
 
 def read_photo(path: Path) -> np.ndarray:

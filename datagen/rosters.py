@@ -1,25 +1,31 @@
 """Rosters: which of people's files can be used, and the hash of all that they hold.
 
-Before: assets.py, sequences.py, animated.py.  After: scenes.py.
+Before: surveys.py, assets.py, sequences.py, animated.py.  After: scenes.py.
 Source: ours.
 """
 
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 
 from datagen.animated import ANIMATED_SUFFIXES, AnimatedAsset, is_animated, load_animated
-from datagen.assets import MESH_SUFFIXES, Roster, files_under, load_mesh, tensors_sha256
+from datagen.assets import MESH_SUFFIXES, Roster, load_mesh, tensors_sha256
 from datagen.formats import MeshError
 from datagen.sequences import CACHE_SUFFIX, survey_sequence
+from datagen.surveys import Kind, survey_folder
 from datagen.usd_files import USD_SUFFIXES, vet_usd
 
-# Named as refused when met in a folder; any other suffix there is taken for a companion file and passed over.
 UNREAD_SUFFIXES = (
     ".dae", ".fbx", ".3ds", ".blend", ".x", ".abc", ".usdz", ".3mf", ".lwo", ".ac", ".ase",
     ".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar",
 )  # fmt: skip
+MESHES = Kind(
+    "mesh",
+    (*MESH_SUFFIXES, *USD_SUFFIXES, CACHE_SUFFIX),
+    (*MESH_SUFFIXES, *ANIMATED_SUFFIXES, CACHE_SUFFIX),
+    UNREAD_SUFFIXES,
+    MeshError,
+)
 
 
 def survey_meshes(folder: str | Path) -> Roster:
@@ -30,30 +36,7 @@ def survey_meshes(folder: str | Path) -> Roster:
 
     Source: ours.
     """
-    names, refused, digest = [], [], hashlib.sha256()
-    for name in files_under(folder):
-        suffix = Path(name).suffix.lower()
-        if suffix in UNREAD_SUFFIXES:
-            refused.append(
-                (
-                    name,
-                    f"expected one of {', '.join((*MESH_SUFFIXES, *USD_SUFFIXES, CACHE_SUFFIX))}, got a {suffix} file",
-                )
-            )
-        if suffix not in (*MESH_SUFFIXES, *ANIMATED_SUFFIXES, CACHE_SUFFIX):
-            continue
-        path = Path(folder) / name
-        try:
-            content = _content(path)
-        except MeshError as error:
-            refused.append((name, error.reason))
-            continue
-        names.append(name)
-        digest.update(name.encode() + b"\0" + content)
-    if not names:
-        found = "; ".join(f"{n}: {r}" for n, r in refused) or "no mesh file at all"
-        raise MeshError(folder, f"expected at least one usable mesh file, got {found}")
-    return Roster(tuple(names), tuple(refused), digest.hexdigest())
+    return survey_folder(folder, MESHES, _content)
 
 
 def survey_played(path: str | Path) -> Roster:

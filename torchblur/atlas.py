@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from torchblur.scene import Mesh
+from torchblur.stopwatch import spent_on
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,7 @@ class Atlas:
     repeats: Tensor  # (M,) bool
 
 
+@spent_on("texture")
 def build_atlas(meshes: tuple[Mesh, ...], device: torch.device) -> Atlas:
     """Return the textures of all meshes, opacity 1 added where a texture has none. Source: Williams 1983."""
     white = torch.ones(1, 1, 4, dtype=torch.float64, device=device)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from torchblur.scene import Scene
+from torchblur.stopwatch import spent_on
 
 # what vertices are known to, as a share of their coordinates: a caster nearer than this to a point does not block it
 GAP = {torch.float32: 1e-6, torch.float64: 1e-11}
@@ -39,6 +40,7 @@ class Casters:
         return len(self.face)
 
 
+@spent_on("shadows")
 @torch.no_grad()
 def find_casters(scene: Scene) -> Casters | None:
     """Return what casts shadows in a scene: every face, lit or not, from both sides, whose opacity is not 0 (or asks

@@ -94,8 +94,7 @@ def cut_cells(prisms: Prisms, intervals: Intervals, may_cross: bool = True) -> C
     layers = _stack_layers(prisms, intervals, None)
     if not may_cross:
         return _pack(intervals, layers, 0)
-    with spent_on("crossings"):
-        crossings = found = _find_crossings(prisms, intervals, layers)
+    crossings = found = _find_crossings(prisms, intervals, layers)
     if len(crossings.pixel) == 0:
         return _pack(intervals, layers, 0)
     while len(found.pixel):
@@ -103,8 +102,7 @@ def cut_cells(prisms: Prisms, intervals: Intervals, may_cross: bool = True) -> C
         with torch.no_grad():
             pending = intervals.of_pixels(pixels)
             layers = _stack_layers(prisms, pending, _of_pixels(crossings, pixels))
-        with spent_on("crossings"):
-            found = _find_crossings(prisms, pending, layers)
+        found = _find_crossings(prisms, pending, layers)
         own, _ = packed.select(intervals.offsets, pixels)
         found = Crossings(pixels[found.pixel], found.t, own[found.pair])
         crossings = _join(crossings, found)
@@ -198,6 +196,7 @@ def _pack(intervals: Intervals, layers: _Layers, n_crossings: int) -> Cells:
     )
 
 
+@spent_on("crossings")
 @torch.no_grad()
 def _find_crossings(prisms: Prisms, intervals: Intervals, layers: _Layers) -> Crossings:
     """Return the crossings inside the cells between layers whose order matters.

@@ -29,6 +29,7 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein, packed
+from torchblur.stopwatch import spent_on
 
 TOLERANCE = 1e-6  # of what is looked at: the contrast of a texture between neighbours, the light on a facing surface
 RHO = (1.6, 2.0, 2.5, 3.0, 4.0, 5.0, 7.0, 10.0, 15.0, 25.0, 50.0, 100.0, 300.0, 1e3, 1e4, 1e6, 1e8)
@@ -59,6 +60,7 @@ class Lookup:
     multiplies: Tensor  # (m,) bool: its opacity multiplies what is behind
 
 
+@spent_on("curvature")
 def nodes_needed(
     dividers: list[Divider], lookup: Lookup, panels: tuple[Tensor, Tensor, Tensor], n_spans: int, slopes: bool = False
 ) -> Tensor:

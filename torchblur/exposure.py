@@ -28,12 +28,11 @@ from torchblur.prisms import Prisms
 from torchblur.resolve import composite_samples, expose_samples, weigh_samples
 from torchblur.scene import Scene
 from torchblur.shutter import Shutter
-from torchblur.stopwatch import spent_on
 from torchblur.subdivide import approximate
 from torchblur.surfaces import Surfaces
 from torchblur.survey import Survey
 
-BYTES_PER_PAIR = 700  # peak of find_intervals; scripts/benchmark.py prints what a budget really takes
+BYTES_PER_PAIR = 700  # peak of find_intervals
 N_LOOKS = 6  # channels: premultiplied colour, opacity, direct light without and with shadows
 
 
@@ -118,16 +117,14 @@ class Exposure:
                 if is_exact:
                     yield place, listing.intervals, listing.cells
                     continue
-                with spent_on("curvature"):
-                    intervals = approximate(work.prisms, listing.intervals, accuracy)
+                intervals = approximate(work.prisms, listing.intervals, accuracy)
                 for pixels in self._chunks(work.prisms.surfaces, intervals):
                     yield (place[0][pixels], place[1][pixels]), intervals.of_pixels(pixels), None
         whole = Block(0, 0, camera.width, camera.height, ray, camera.width, camera.height)
         for block, candidates in self._blocks(work.prisms, whole, work.chosen):
             with self.ledger.stage("intervals", self.scene.device):
                 intervals, counts = find_visible_intervals(work.prisms, work.survey, block, candidates)
-                with spent_on("curvature"):
-                    intervals = approximate(work.prisms, intervals, accuracy)
+                intervals = approximate(work.prisms, intervals, accuracy)
             self.ledger.add("blocks", 1)
             self.ledger.add_many(counts | {"intervals": intervals.count})
             if intervals.count == 0:

@@ -19,6 +19,7 @@ from torchblur.certificate import VECTOR_LIMIT, Divider
 from torchblur.lights import SpotLight
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
+from torchblur.stopwatch import spent_on
 
 NOISE = 1e-14  # of the product of the factors' sizes
 FLAT = 1e-9  # cosine of a cone that is a half-space
@@ -38,6 +39,7 @@ class LightPaths:
     is_near: tuple[bool, ...]  # whether V holds S, light by light
 
     @classmethod
+    @spent_on("lighting")
     def of(cls, prisms: Prisms, paths: Paths) -> LightPaths:
         """Return what the lit among the scene's layers, `paths`, do."""
         world = prisms.world.index_select(-1, paths.prism)
@@ -53,6 +55,7 @@ class LightPaths:
         vectors = tuple(light.path(place, paths.scale, paths.t) for light in lights)
         return cls(paths, place, normals, vectors, tuple(len(v) > 2 for v in vectors))
 
+    @spent_on("lighting")
     def bends(self, prisms: Prisms) -> tuple[Tensor, Tensor]:
         """Return the paths (B,) and times tau (B,) at which the light on them may bend."""
         paths, taus = [self.paths.span[:0]], [self.paths.t[0, :0]]

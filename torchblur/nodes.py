@@ -25,7 +25,6 @@ from torchblur.paths import Paths, cut_spans, follow
 from torchblur.prisms import Prisms
 from torchblur.shadows import Shadows, find_shadows
 from torchblur.sort import SAME_TIME, argsort_by, between
-from torchblur.stopwatch import spent_on
 from torchblur.surfaces import Surfaces
 from torchblur.texture_bends import TexturePaths
 
@@ -112,18 +111,14 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
     which_textured = surfaces.is_textured[paths.face].nonzero().flatten()
     is_lit = surfaces.is_lit[paths.face] if surfaces.lights else torch.zeros_like(paths.span, dtype=torch.bool)
     which_lit = is_lit.nonzero().flatten()
-    with spent_on("texture"):
-        textured = TexturePaths.of(prisms, paths.choose(which_textured))
-    with spent_on("lighting"):
-        lit = LightPaths.of(prisms, paths.choose(which_lit))
     return Varying(
         cell=spans.cell,
         start=spans.start,
         end=spans.end,
         paths=paths,
-        textured=textured,
+        textured=TexturePaths.of(prisms, paths.choose(which_textured)),
         which_textured=which_textured,
-        lit=lit,
+        lit=LightPaths.of(prisms, paths.choose(which_lit)),
         which_lit=which_lit,
     )
 
@@ -134,8 +129,7 @@ def add_shadows(prisms: Prisms, varying: Varying | None) -> Varying | None:
     if varying is None or prisms.surfaces.casters is None or len(varying.which_lit) == 0:
         return varying
     lit = varying.lit
-    with spent_on("shadows"):
-        return replace(varying, shadows=find_shadows(prisms.surfaces, lit.receivers(), lit.due(prisms)))
+    return replace(varying, shadows=find_shadows(prisms.surfaces, lit.receivers(), lit.due(prisms)))
 
 
 @torch.no_grad()
@@ -259,15 +253,13 @@ def _cut_panels(prisms: Prisms, varying: Varying) -> tuple[Tensor, Tensor, Tenso
     """Return span, start and end (p,) of the slices between the bends."""
     every = torch.arange(len(varying.cell), device=varying.cell.device)
     owners, taus = [every, every], [torch.zeros_like(varying.start), torch.ones_like(varying.start)]
-    for effect, curves in (("texture", varying.textured), ("lighting", varying.lit)):
-        with spent_on(effect):
-            which, tau = curves.bends(prisms)
+    for curves in (varying.textured, varying.lit):
+        which, tau = curves.bends(prisms)
         inside = ((tau > 0) & (tau < 1)).nonzero().flatten()
         owners.append(curves.paths.span[which[inside]])
         taus.append(tau[inside])
     if varying.shadows is not None:
-        with spent_on("shadows"):
-            which, tau = varying.shadows.ends(prisms.surfaces)
+        which, tau = varying.shadows.ends(prisms.surfaces)
         owners.append(varying.lit.paths.span[which])
         taus.append(tau)
     return between(torch.cat(owners), torch.cat(taus))
@@ -297,8 +289,7 @@ def _count_nodes(
     done = []
     for k in range(MAX_HALVINGS + 1):
         span, start, end = panels
-        with spent_on("curvature"):
-            needed = nodes_needed(dividers, lookup, panels, n_spans, slopes)
+        needed = nodes_needed(dividers, lookup, panels, n_spans, slopes)
         place = torch.searchsorted(counts[:-1].to(needed.dtype), needed)
         is_ready = place < len(COUNTS)
         if k >= FREE_HALVINGS:

@@ -23,6 +23,7 @@ from torchblur.lights import DirectionalLight, Light, along
 from torchblur.shading import Points
 from torchblur.shadow_pairs import candidate_pairs, sifted_pairs
 from torchblur.sort import SAME_TIME, argsort_by
+from torchblur.stopwatch import spent_on
 from torchblur.surfaces import Surfaces
 from torchblur.texture import lookup
 
@@ -64,6 +65,7 @@ class Shadows:
         """Most ranges of one receiver and light."""
         return max((int(r.offsets.diff().max()) for r in self.ranges if r and len(r.offsets) > 1), default=0)
 
+    @spent_on("shadows")
     def ends(self, surfaces: Surfaces) -> tuple[Tensor, Tensor]:
         """Return the receivers (B,) and times (B,) at which a light on them is blocked or freed, and between which a
         blocked one varies by as much as one look may stand for.
@@ -114,6 +116,7 @@ class Shadows:
         return torch.stack(rows)
 
 
+@spent_on("shadows")
 @torch.no_grad()
 def find_shadows(surfaces: Surfaces, receivers: Receivers, is_due: tuple[Tensor, ...]) -> Shadows:
     """Return when casters come between the lights and the receivers.

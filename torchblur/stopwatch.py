@@ -47,7 +47,7 @@ def watching() -> Iterator[Watch]:
 
 @contextmanager
 def spent_on(effect: str) -> Iterator[None]:
-    """Count what is spent inside as spent on `effect`, if anybody is watching."""
+    """Count what is spent inside, or in what this decorates, as spent on `effect`, if anybody is watching."""
     watch = _running.get()
     if watch is None:
         yield

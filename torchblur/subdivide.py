@@ -19,6 +19,7 @@ from torchblur import bernstein, edges, packed
 from torchblur.accuracy import Accuracy
 from torchblur.intervals import Intervals, nearness_coefficients
 from torchblur.prisms import Prisms
+from torchblur.stopwatch import spent_on
 
 SAMPLES_PER_TIME = 20  # depths looked at per unit of shutter time, for extrema (the paper's number)
 MAX_HALVINGS = 12  # of a piece between two extrema; what is left is accepted
@@ -73,6 +74,7 @@ class _Pieces:
     nearness: Tensor  # (2, m) float64
 
 
+@spent_on("curvature")
 def approximate(prisms: Prisms, intervals: Intervals, accuracy: Accuracy) -> Intervals:
     """Return intervals along which nearness, and with it depth, is what `accuracy` asks for.
 

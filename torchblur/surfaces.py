@@ -16,7 +16,6 @@ from torchblur.atlas import Atlas, build_atlas
 from torchblur.casters import Casters, find_casters
 from torchblur.lights import Light
 from torchblur.scene import Mesh, Scene
-from torchblur.stopwatch import spent_on
 
 
 @dataclass(frozen=True)
@@ -69,10 +68,7 @@ def build_surfaces(scene: Scene) -> Surfaces:
 
     is_opaque = (opacity.detach() == 1) & ~per_face(varies)
     lights_move = any(p.ndim == 2 for light in scene.lights for p in light.tensors().values())
-    with spent_on("shadows"):
-        casters = find_casters(scene)
-    with spent_on("texture"):
-        atlas = build_atlas(meshes, device)
+    casters = find_casters(scene)
     light_changes = lights_move or (casters is not None and casters.moves)
     varying = [
         (m.material.texture is not None and not scene.is_still(m))
@@ -89,7 +85,7 @@ def build_surfaces(scene: Scene) -> Surfaces:
         is_textured=per_face([t is not None for t in textures]),
         has_varying_opacity=per_face(varies),
         uv=cat([_face_uv(m) for m in meshes], (0, 3, 2), f64),
-        atlas=atlas,
+        atlas=build_atlas(meshes, device),
         is_varying=per_face(varying),
         is_lit=per_face([m.material.shading == "lambert" for m in meshes]),
         has_normals=per_face([m.normals is not None for m in meshes]),

@@ -16,6 +16,7 @@ from torchblur import bernstein, edges, packed
 from torchblur.certificate import Lookup
 from torchblur.paths import Paths
 from torchblur.prisms import Prisms
+from torchblur.stopwatch import spent_on
 from torchblur.texture import to_texels
 
 NOISE = 1e-14  # of the largest coefficient: rounding of products of degree 8
@@ -32,6 +33,7 @@ class TexturePaths:
     level: Tensor  # (2, K) float64 least and greatest level, whole numbers
 
     @classmethod
+    @spent_on("texture")
     def of(cls, prisms: Prisms, paths: Paths) -> TexturePaths:
         """Return the places of the textured among `paths`."""
         uv = prisms.corner_uv(paths.prism)
@@ -84,6 +86,7 @@ class TexturePaths:
             total = total.index_add(0, which, (high - low + 1).clamp(min=0))
         return total
 
+    @spent_on("texture")
     def bends(self, prisms: Prisms) -> tuple[Tensor, Tensor]:
         """Return the paths (B,) and times tau (B,), in [0, 1] or not, at which a lookup may bend."""
         paths, taus = [], []

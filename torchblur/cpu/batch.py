@@ -21,9 +21,9 @@ import numpy as np
 
 from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import restrict_cubic
+from torchblur.edges import EDGE_SIGN, FIRST, SECOND
 
 ROOM = 256  # pairs of a batch
-FIRST, SECOND = (1, 0, 0), (2, 2, 1)  # as in edges.py
 X, Y, W, Z = 0, 1, 2, 3
 HARD, ONE_PIECE = 2.0, 1.0  # states of a pair; 0 where nothing is covered
 UNSURE = 1e-12  # of the largest product: an edge function this small may have either sign
@@ -104,8 +104,7 @@ def set_up(
     middle, reach_x, reach_y = (tile[0], tile[1]), tile[2], tile[3]
     most = 0.0
     for edge in range(3):
-        i, j = FIRST[edge], SECOND[edge]
-        turn = -1.0 if edge == 1 else 1.0
+        i, j, turn = FIRST[edge], SECOND[edge], EDGE_SIGN[edge]
         a, b = _corner(clip, k, 0, i, middle), _corner(clip, k, 0, j, middle)
         c, d = _corner(clip, k, 1, i, middle), _corner(clip, k, 1, j, middle)
         da, db = (c[0] - a[0], c[1] - a[1], c[2] - a[2]), (d[0] - b[0], d[1] - b[1], d[2] - b[2])
@@ -129,8 +128,7 @@ def set_up(
         setup[row, n] = 0.0
     sizes = (0.0, 0.0, 0.0, 0.0)
     for edge in range(3):
-        i, j = FIRST[edge], SECOND[edge]
-        turn = -1.0 if edge == 1 else 1.0
+        i, j, turn = FIRST[edge], SECOND[edge], EDGE_SIGN[edge]
         a, b = _corner(clip, k, 0, i, own), _corner(clip, k, 0, j, own)
         c, d = _corner(clip, k, 1, i, own), _corner(clip, k, 1, j, own)
         at_start, first, second, at_end = _cross(a, b), _cross(a, d), _cross(c, b), _cross(c, d)

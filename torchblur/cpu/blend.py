@@ -231,11 +231,11 @@ def see_tiles(
             counts[0] += n
             counts[4] = max(counts[4], n)
             n_cells, n_crossings = 0, 0
-            if mode != LIST_INTERVALS:
+            while mode != LIST_INTERVALS:
                 n_cells, n_crossings = sweep(borrowed(ray), n, borrowed(cells), shortest, borrowed(solver))
-                while n_cells == NO_ROOM:
-                    cells = make_cells(2 * len(cells.t), 2 * len(cells.layer))
-                    n_cells, n_crossings = sweep(borrowed(ray), n, borrowed(cells), shortest, borrowed(solver))
+                if n_cells != NO_ROOM:
+                    break
+                cells = make_cells(2 * len(cells.t), 2 * len(cells.layer))
             counts[1] += n_cells
             counts[2] += cells.first[n_cells]
             counts[3] += n_crossings

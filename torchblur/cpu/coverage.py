@@ -15,9 +15,8 @@ import numpy as np
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.jit import jit
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
-from torchblur.edges import CLIP_NOISE
+from torchblur.edges import CLIP_NOISE, FIRST, SECOND
 
-FIRST, SECOND = (1, 0, 0), (2, 2, 1)  # as in edges.py
 MAX_CUTS = 14  # 0, 1, two roots of each edge and three of each clip plane
 HALF_GAUSS = 0.5 / math.sqrt(3)
 

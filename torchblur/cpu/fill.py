@@ -13,7 +13,7 @@ import itertools
 import numpy as np
 
 from torchblur.cpu import batch as batches
-from torchblur.cpu.batch import Batch
+from torchblur.cpu.batch import Batch, W, X, Y, Z
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
 from torchblur.cpu.jit import borrowed, jit
 from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START
@@ -28,7 +28,6 @@ MOST_PIECES = 16  # more than the intervals of one pair
 EVERY = 16  # prisms after which the tile's cover is looked at anew
 WIDE = 5  # columns from which on the hull of a prism is worth its cost
 PAIRS = np.array(list(itertools.combinations(range(6), 2)))
-X, Y, W, Z = 0, 1, 2, 3
 _U = np.uint64  # see batch.py
 
 
@@ -77,7 +76,7 @@ def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int,
         if not (is_front or is_back):
             low, high = -np.inf, np.inf
         data[n, T_START], data[n, T_END] = start, end
-        data[n, LOW], data[n, HIGH] = low - TIE * abs(low), high + TIE * abs(high)
+        data[n, LOW], data[n, HIGH] = low, high
         tile.prism[n], tile.next[n] = k, pixel
     _keep(geometry, view, tile, n_pieces)
 
@@ -94,6 +93,8 @@ def _keep(geometry: Geometry, view: View, tile: Tile, n: int) -> None:
     first = place
     for m in range(first, first + n):
         k, pixel, low, high = prism[m], following[m], data[m, LOW], data[m, HIGH]
+        # ranges that are apart are so by more than surfaces that count as coplanar
+        low, high = low - TIE * abs(low), high + TIE * abs(high)
         start, end = data[m, T_START], data[m, T_END]
         opens, closes = t[k, 0], t[k, 1]
         t_start, t_end = (1 - start) * opens + start * closes, (1 - end) * opens + end * closes
@@ -105,7 +106,7 @@ def _keep(geometry: Geometry, view: View, tile: Tile, n: int) -> None:
             prism[place] = k
             for c in range(N_NUMBERS):
                 data[place, c] = data[m, c]
-        data[place, T_START], data[place, T_END] = t_start, t_end
+        data[place, T_START], data[place, T_END], data[place, LOW], data[place, HIGH] = t_start, t_end, low, high
         following[place] = last_of[pixel]
         last_of[pixel] = place
         place += 1
@@ -133,9 +134,7 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
         for c in range(8):
             data[place, NUM + c] = near[m + _U(c * batches.ROOM)]
         data[place, T_START], data[place, T_END] = near[m + batches.FROM], near[m + batches.TO]
-        # ranges that are apart are so by more than surfaces that count as coplanar
-        low, high = near[m + batches.LOW], near[m + batches.HIGH]
-        data[place, LOW], data[place, HIGH] = low - TIE * abs(low), high + TIE * abs(high)
+        data[place, LOW], data[place, HIGH] = near[m + batches.LOW], near[m + batches.HIGH]
         prism[place], following[place] = who[pair, 0], who[pair, 2]
         count += 1
     _keep(geometry, view, own, count)

@@ -16,6 +16,7 @@ from torchblur.cpu.sieve import may_block, scratch_room
 
 Things = tuple[Tensor, Tensor, Tensor]
 STARTING_ROOM = 1 << 12  # pairs
+APART, CANDIDATE, BLOCKS = 0, 1, 2
 
 
 def join(receiver: Things, caster: Things, sees_all: bool, arrays: tuple) -> tuple[tuple[Tensor, Tensor], int]:
@@ -43,14 +44,12 @@ def _join_all(a, b, arrays, room):
     a, b, arrays, room = borrowed(a), borrowed(b), borrowed(arrays), borrowed(room)
     for i in range(len(a[0])):
         for j in range(len(b[0])):
-            if _meet(a, b, (i, j), arrays):
-                n += 1
-                pair = a[0][i], b[0][j]
-                if may_block(pair, arrays[1], room):
-                    if count == len(out):
-                        out = _grown(out)
-                    out[count, 0], out[count, 1] = pair
-                    count += 1
+            verdict = _look(a, b, (i, j), arrays, room)
+            n += verdict > 0
+            if verdict == BLOCKS:
+                out = _with_room(out, count)
+                out[count, 0], out[count, 1] = a[0][i], b[0][j]
+                count += 1
     return out[:count].copy(), n
 
 
@@ -81,23 +80,32 @@ def _join_levels(a, b, arrays, room):
                         j = held[place]
                         if max(cells_a[i, 0], cells_b[j, 0]) != x or max(cells_a[i, 1], cells_b[j, 1]) != y:
                             continue  # seen in another cell
-                        if _meet(a, b, (of_a[i], of_b[j]), arrays):
-                            n += 1
-                            pair = a[0][of_a[i]], b[0][of_b[j]]
-                            if may_block(pair, arrays[1], room):
-                                if count == len(out):
-                                    out = _grown(out)
-                                out[count, 0], out[count, 1] = pair
-                                count += 1
+                        places = of_a[i], of_b[j]
+                        verdict = _look(a, b, places, arrays, room)
+                        n += verdict > 0
+                        if verdict == BLOCKS:
+                            out = _with_room(out, count)
+                            out[count, 0], out[count, 1] = a[0][places[0]], b[0][places[1]]
+                            count += 1
     return out[:count].copy(), n
 
 
 @jit
-def _grown(out):
-    """Return rows with room for as many again."""
+def _with_room(out, count):
+    """Return the rows, of which `count` are taken, with room for one more."""
+    if count < len(out):
+        return out
     more = np.empty((2 * len(out), 2), dtype=np.int64)
     more[: len(out)] = out
     return more
+
+
+@inlined
+def _look(a, b, places, arrays, room):
+    """Return APART, CANDIDATE or BLOCKS, the last where a candidate may do so, of two things."""
+    if not _meet(a, b, places, arrays):
+        return APART
+    return BLOCKS if may_block((a[0][places[0]], b[0][places[1]]), arrays[1], room) else CANDIDATE
 
 
 @inlined

@@ -1,6 +1,6 @@
 """Run log: how long the runs of a data set took, for its report; no byte of a frame depends on it.
 
-Before: writer.py.  After: runs.py writes it, pages.py and checks.py read it.
+Before: folders.py, writer.py.  After: runs.py writes it, pages.py and checks.py read it.
 `.runs.log` has one line of JSON for each run that made or failed to make a frame; a run that was killed has none.
 Slices append to the same file, a line in one write. Each line has its checksum; a run of the whole set drops those
 that were damaged.
@@ -8,7 +8,6 @@ that were damaged.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
 import os
@@ -20,6 +19,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from datagen.folders import record_sum
 from datagen.writer import write_atomically
 
 LOG_NAME = ".runs.log"
@@ -104,10 +104,7 @@ def read_log(folder: str | Path) -> tuple[list[RunNote], int]:
 
 def encode_line(fields: dict[str, Any]) -> bytes:
     """Return a note's fields as its line of the log, with its checksum. Source: ours."""
-    text = json.dumps(fields, sort_keys=True)
-    return (
-        json.dumps(fields | {"line_sha256": hashlib.sha256(text.encode()).hexdigest()}, sort_keys=True).encode() + b"\n"
-    )
+    return json.dumps(fields | {"line_sha256": record_sum(fields)}, sort_keys=True).encode() + b"\n"
 
 
 def _drop_damaged_lines(folder: Path) -> None:

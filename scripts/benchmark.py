@@ -50,12 +50,11 @@ def measure(name: str) -> dict[str, Any]:
     first_s, _ = best(lambda: tb.render(scene, backend="cpu"), 1)
     exact_s, frame = best(lambda: tb.render(scene, backend="cpu"))
     peak_mb = _peak_mb()
-    counts = {k: frame.counts[k] for k in ("prisms", "pairs", "intervals", "deepest_pixel", "cells")}
     found: dict[str, Any] = {
         "scene": name,
         "size_px": [case.width, case.height],
         "triangles": sum(m.n_faces for m in scene.meshes),
-        **counts,
+        **_counted(frame),
         "exact_s": exact_s,
         "first_s": first_s,
         "stages_s": frame.timings,
@@ -83,13 +82,13 @@ def measure_curve(name: str, threads: int) -> dict[str, Any]:
         tb.render(scene, backend="cpu")
         seconds, frame = best(lambda scene=scene: tb.render(scene, backend="cpu"), 3)
         triangles, pixels = sum(m.n_faces for m in scene.meshes), scene.camera.width * scene.camera.height
-        rows.append({"value": value, "s": seconds, "triangles": triangles, "pixels": pixels, **_whole(frame.counts)})
+        rows.append({"value": value, "s": seconds, "triangles": triangles, "pixels": pixels, **_counted(frame)})
     by = {"triangles": "triangles", "pixels": "pixels"}.get(name, "intervals")
     return {"curve": name, "by": by, "threads": threads, "rows": rows, "slope": _slope([(r[by], r["s"]) for r in rows])}
 
 
-def _whole(counts: dict[str, int]) -> dict[str, int]:
-    return {k: counts[k] for k in ("prisms", "intervals", "cells", "layers", "deepest_pixel")}
+def _counted(frame: tb.Frame) -> dict[str, int]:
+    return {k: frame.counts[k] for k in ("prisms", "pairs", "intervals", "deepest_pixel", "cells", "layers")}
 
 
 def _slope(points: list[tuple[float, float]]) -> float:

@@ -42,9 +42,7 @@ def character(
     width: int, height: int, opacity: float = 1.0, detail: tuple[int, int] = CHARACTER, motion: float = 1.0
 ) -> tb.Scene:
     """Return a running figure; `motion` stretches its stride."""
-    ends = (0.0, motion)
-    poses = [paper_scenes.pose(end, (-0.1 + 0.25 * end, -0.15 + 0.06 * end)) for end in ends]
-    return _plain(paper_scenes.figure(16, poses, detail), opacity, (width, height))
+    return _plain(paper_scenes.figure(16, paper_scenes.stride(motion), detail), opacity, (width, height))
 
 
 def cloth(width: int, height: int) -> tb.Scene:

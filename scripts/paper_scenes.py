@@ -53,8 +53,7 @@ def chip(size: int = 256) -> tb.Scene:
 
 def character(size: int = 256) -> tb.Scene:
     """Return a running figure of 14 parts and 8,512 triangles, each limb on its own way in one linear piece."""
-    poses = [pose(float(end), (-0.1 + 0.25 * end, -0.15 + 0.06 * end)) for end in range(2)]
-    return tb.Scene(figure(size, poses), still_camera(size, size), BACKDROP)
+    return tb.Scene(figure(size, stride()), still_camera(size, size), BACKDROP)
 
 
 def transparent(size: int = 256) -> tb.Scene:
@@ -236,6 +235,11 @@ def pose(share: float, hip: tuple[float, float]) -> Pose:
         joints[name] = base + turn @ torch.tensor([0.0, length, 0.0], dtype=torch.float64)
         poses[name] = FIGURE_SCALE * facing @ base, FIGURE_SCALE * facing @ turn
     return poses
+
+
+def stride(length: float = 1.0) -> list[Pose]:
+    """Return the two ends of a stride, `length` times as long."""
+    return [pose(end, (-0.1 + 0.25 * end, -0.15 + 0.06 * end)) for end in (0.0, length)]
 
 
 def figure(size: int, poses: Sequence[Pose], detail: tuple[int, int] = (16, 6)) -> list[tb.Mesh]:

@@ -6,6 +6,7 @@ Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -61,8 +62,8 @@ class Exposure:
     def image(self, ray: Ray) -> Tensor:
         """Return (shutters, H, W, N_LOOKS + M) float64: looks and coverage for one ray per pixel. Source: see above."""
         camera, device = self.scene.camera, self.scene.device
-        if self.backend == "cpu" and self._is_plain():
-            return self._composite(ray)
+        if self.backend == "cpu" and self._way().method == "exact" and self.work.prisms.surfaces.casters is None:
+            return self._composite(ray) if self._is_plain() else self._integrate(ray)
         places, values = [], []
         for (column, row), intervals, cells in self._seen(ray):
             places.append(row * camera.width + column)
@@ -74,10 +75,9 @@ class Exposure:
         return image.reshape(camera.height, camera.width, -1, n_channels).movedim(2, 0)
 
     def _is_plain(self) -> bool:
-        """Return whether colours are constant and depth is followed as it is, so that cells need no further look."""
+        """Return whether colours are constant, so that cells need no further look."""
         surfaces = self.work.prisms.surfaces
-        is_looked_at = bool((surfaces.is_textured | surfaces.is_lit).any()) or self._is_forced("curvature")
-        return self._way().method == "exact" and not is_looked_at
+        return not ((surfaces.is_textured | surfaces.is_lit).any() or self._is_forced("curvature"))
 
     def _is_forced(self, name: str) -> bool:
         return self.work.plan[name].forced
@@ -98,6 +98,19 @@ class Exposure:
             image, counts = visibility.composite(self._sight(), self.scene, ray, may_cross)
         self.ledger.add_many(counts)
         return image
+
+    def _integrate(self, ray: Ray) -> Tensor:
+        """Return what `image` does, where looks may vary and nothing casts shadows."""
+        may_cross = "crossings" in self.work.plan.simulated
+        with self.ledger.stage("intervals", self.scene.device):
+            steps = visibility.integrate(self._sight(), self.scene, ray, may_cross, self.memory_bytes)
+        names = itertools.cycle(("intervals", "resolve"))
+        while True:
+            with self.ledger.stage(next(names), self.scene.device):
+                image, counts = next(steps)
+            self.ledger.add_many(counts)
+            if image is not None:
+                return image
 
     def _seen(self, ray: Ray) -> Iterator[tuple[tuple[Tensor, Tensor], Intervals, Cells | None]]:
         """Yield column and row of some pixels, the intervals of these, and their cells where they are cut already."""

@@ -52,7 +52,7 @@ class Listed(NamedTuple):
 
 
 @jit
-def _integral(colours: Colours, s: int, t: float) -> float:
+def integral(colours: Colours, s: int, t: float) -> float:
     """Return the weight of shutter `s` before a time of its first line; see `Shutter.weight`. Not yet divided."""
     total, first, time, weight = 0.0, colours.first, colours.time, colours.weight
     for k in range(first[s], first[s + 1] - 1):
@@ -92,8 +92,8 @@ def _composite(
     for k in range(seen_in[1]):
         is_gap = k == 0 or t[k - 1, 1] != t[k, 0]
         for s in range(n_shutters):
-            before = _integral(colours, s, t[k, 0] - delays[0, s]) if is_gap else delays[3, s]
-            delays[3, s] = _integral(colours, s, t[k, 1] - delays[0, s])
+            before = integral(colours, s, t[k, 0] - delays[0, s]) if is_gap else delays[3, s]
+            delays[3, s] = integral(colours, s, t[k, 1] - delays[0, s])
             delays[2, s] = (delays[3, s] - before) / delays[1, s]
         red, green, blue, left = 0.0, 0.0, 0.0, 1.0
         for m in range(first[k], first[k + 1]):
@@ -212,7 +212,7 @@ def see_tiles(
     n_shutters = len(colours.delay)
     delays, seen = np.zeros((4, n_shutters)), np.zeros(max(0, image.shape[3] - N_LOOKS), np.int64)
     for s in range(n_shutters):
-        delays[1, s] = _integral(colours, s, colours.time[colours.first[s + 1] - 1])
+        delays[1, s] = integral(colours, s, colours.time[colours.first[s + 1] - 1])
     window = (view.start, view.end)
     shortest = MIN_CELL * (view.end - view.start) if view.may_cross else np.inf
     for which_tile in which:

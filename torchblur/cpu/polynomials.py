@@ -1,6 +1,6 @@
 """Polynomials by their Bernstein coefficients, one at a time: what bernstein.py does for many at once.
 
-Before: jit.py.  After: coverage.py, sweep.py.
+Before: jit.py.  After: coverage.py, sweep.py, bends.py.
 Symbols: rows of arrays hold the coefficients on [0, 1]; u in [0, 1].
 Source: as bernstein.py.
 """
@@ -12,7 +12,7 @@ import numpy as np
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.jit import inlined, jit
 
-MAX_DEGREE = 6  # of a difference of two nearnesses
+MAX_DEGREE = 8  # 6 of a difference of two nearnesses, 8 of mip levels and cones
 NARROW = 2.0**-51  # relative: step or bracket that ends the search for a root
 MAX_STEPS = 100  # twice the bits there are
 

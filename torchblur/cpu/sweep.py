@@ -24,6 +24,7 @@ from torchblur.sort import TIE
 
 T_START, T_END, NUM, DEN, LOW, HIGH, N_NUMBERS = 0, 1, 2, 6, 10, 11, 12
 PRISM, RANK, IS_OPAQUE, UPPER, N_MARKS = 0, 1, 2, 3, 4
+N_CROSSING = 7  # coefficients of a difference of two nearnesses
 NO_ROOM = -1
 
 
@@ -192,7 +193,7 @@ def _first_crossing(ray: Ray, pair: tuple[int, int], start: float, least: float,
     size_i = _largest(a0, a1, a2, a3) * _largest(q0, q1, q2, q3)
     size_j = _largest(p0, p1, p2, p3) * _largest(b0, b1, b2, b3)
     first = end
-    for k in range(roots_of(f, MAX_DEGREE + 1, CROSSING_NOISE * (size_i + size_j), solver.found)):
+    for k in range(roots_of(f, N_CROSSING, CROSSING_NOISE * (size_i + size_j), solver.found)):
         t = start + solver.found[k] * (end - start)
         if t - start > least:
             first = min(first, t)

@@ -17,9 +17,11 @@ from torch import Tensor
 from torchblur import packed
 from torchblur.camera import Ray
 from torchblur.cells import Cells
-from torchblur.cpu import blend
-from torchblur.cpu.instant import on_threads
+from torchblur.cpu import blend, expose
+from torchblur.cpu.curves import find_stock
+from torchblur.cpu.instant import looks_of, on_threads
 from torchblur.cpu.jit import announce
+from torchblur.cpu.lambert import find_lit
 from torchblur.cpu.sweep import DEN, LOW, NUM, T_END, T_START
 from torchblur.cpu.tiles import Geometry, View
 from torchblur.intervals import Intervals
@@ -109,6 +111,37 @@ def composite(sight: Sight, scene: Scene, ray: Ray, may_cross: bool) -> tuple[Te
     return torch.from_numpy(image).movedim(2, 0), _total(counts)
 
 
+def integrate(
+    sight: Sight, scene: Scene, ray: Ray, may_cross: bool, memory_bytes: int
+) -> Iterator[tuple[Tensor | None, dict[str, int]]]:
+    """Look along all rays, some tiles at a time, and integrate what textures and lights make of it.
+
+    Args:
+        sight, scene, ray, may_cross, memory_bytes: as in `list_seen`.
+
+    Yields:
+        By turns: nothing, once cells are listed, with the counts of these; then nothing, once they are integrated, with
+        the number of samples. At last what `composite` returns.
+
+    Source: ours.
+    """
+    surfaces, camera = sight.prisms.surfaces, scene.camera
+    image = np.zeros((camera.height, camera.width, len(sight.colours.delay), blend.N_LOOKS + len(scene.meshes)))
+    times = sorted({t for light in surfaces.lights for t in light.knots})
+    what = expose.Scene(
+        find_stock(sight.prisms),
+        looks_of(surfaces, scene, ray),
+        find_lit(scene, surfaces),
+        sight.colours,
+        np.array(times, dtype=np.float64),
+        _view(sight, scene, ray, may_cross),
+    )
+    for listings, counts in _list_tiles(sight, what.rays, blend.LIST_CELLS, memory_bytes):
+        yield None, counts
+        yield None, {"nodes": sum(on_threads(lambda listed: expose.expose(listed, what, image), listings))}
+    yield torch.from_numpy(image).movedim(2, 0), {}
+
+
 def list_seen(
     sight: Sight, scene: Scene, ray: Ray, how: tuple[bool, bool], memory_bytes: int
 ) -> Iterator[tuple[Listing, dict[str, int]]]:
@@ -125,9 +158,16 @@ def list_seen(
     Source: ours.
     """
     may_cross, cut = how
-    view = _view(sight, scene, ray, may_cross)
-    offsets, prisms, load = blend.bin_prisms(sight.geometry, view)
     mode = blend.LIST_CELLS if cut else blend.LIST_INTERVALS
+    for listings, counts in _list_tiles(sight, _view(sight, scene, ray, may_cross), mode, memory_bytes):
+        yield _join(listings, scene, ray), counts
+
+
+def _list_tiles(
+    sight: Sight, view: View, mode: int, memory_bytes: int
+) -> Iterator[tuple[list[blend.Listed], dict[str, int]]]:
+    """Yield listings of some tiles at a time, and their counts."""
+    offsets, prisms, load = blend.bin_prisms(sight.geometry, view)
     no_image = np.zeros((0, 0, 0, 0))
 
     def see(tiles: np.ndarray) -> tuple[blend.Listed, np.ndarray]:
@@ -136,10 +176,10 @@ def list_seen(
     n_jobs = max(1, int(load.sum() * BYTES_PER_LOAD / memory_bytes) + 1)
     busy = np.flatnonzero(load)
     for tiles in np.array_split(busy, min(n_jobs, max(len(busy), 1))):
-        found = on_threads(see, _shares(load, torch.get_num_threads(), tiles))
+        found = on_threads(see, _shares(load, _n_jobs(), tiles))
         listings = [listed for listed, _ in found if listed.size[0]]
         if listings:
-            yield _join(listings, scene, ray), _total([counts for _, counts in found])
+            yield listings, _total([counts for _, counts in found])
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -1,0 +1,315 @@
+"""Integrate listed cells whose looks may vary over the exposure: nodes.py and resolve.py, one ray at a time.
+
+Before: blend.py, bends.py, panels.py, shine.py.  After: visibility.py.
+Symbols: S shutters; a cell in which nothing varies is looked at once, in its middle; else its spans are cut where looks
+bend, and the panels between get as many of Gauss's nodes as panels.py asks for.
+Source: Ronnow et al. 2021, alg. 1 (resolve); Gauss-Legendre quadrature; ours.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from torchblur.cpu.bends import Bends, find_bends, make_bends
+from torchblur.cpu.blend import DOWN, N_LOOKS, RIGHT, UP, Colours, Listed, integral
+from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, TEXTURED, VARYING, Span, Stock, follow, make_span
+from torchblur.cpu.jit import borrowed, inlined, jit
+from torchblur.cpu.lambert import Lit
+from torchblur.cpu.layers import Looks
+from torchblur.cpu.panels import count_nodes
+from torchblur.cpu.shine import look_at, place_at
+from torchblur.cpu.tiles import View
+from torchblur.nodes import COUNTS, FREE_HALVINGS, MANY, MAX_HALVINGS
+from torchblur.sort import SAME_TIME
+
+NODE, SHARE = np.zeros((2, COUNTS[-1] + 1, COUNTS[-1]))  # on [0, 1], and their weights, which add up to 1
+for _n in range(1, COUNTS[-1] + 1):
+    NODE[_n, :_n], SHARE[_n, :_n] = (0.5 * (a + b) for a, b in zip(np.polynomial.legendre.leggauss(_n), (1, 0)))
+DELAY, AREA, BEFORE, WEIGHT, LEVEL, RISE, N_ROWS = 0, 1, 2, 3, 4, 5, 6  # of what is kept of each shutter
+
+
+class Scene(NamedTuple):
+    """What there is, and how rays see it."""
+
+    stock: Stock
+    looks: Looks
+    lit: Lit
+    colours: Colours
+    knots: np.ndarray  # (K,) shutter times at which a light bends
+    rays: View
+
+
+class Room(NamedTuple):
+    """What the rays of a thread work in."""
+
+    shutter: np.ndarray  # (N_ROWS, S): delay of the line, area of the weights, their integral before, weight of a
+    #                      sample; and over a span the weight at its start and the rise to its end
+    ends: np.ndarray  # (most spans + 1,) shares of the cell at which its spans end
+    stack: np.ndarray  # (MAX_HALVINGS + 2, 3) panels yet to be done: start, end, halvings
+    moment: np.ndarray  # (S, 4) integrals of 1, x, y, x y over a panel
+    seen: np.ndarray  # (M,) int64 sample in which a mesh was seen last
+    count: np.ndarray  # (2,) int64 samples, and panels halved often in this span
+
+
+@jit
+def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
+    """Add what listed cells show to an image (H, W, S, C), and return how many samples that took. Source: ours."""
+    listed, image = borrowed(listed), borrowed(image)
+    stock, looks, colours, view = borrowed(scene.stock), borrowed(scene.looks), borrowed(scene.colours), scene.rays
+    knots, lit = borrowed(scene.knots), borrowed(scene.lit)
+    n_lamps, n_shutters = len(lit.kind), len(colours.delay)
+    span, bends = make_span(8, n_lamps), make_bends(256)
+    room = Room(
+        np.zeros((N_ROWS, n_shutters)),
+        np.empty(len(colours.time) + len(knots) + 2),
+        np.empty((MAX_HALVINGS + 2, 3)),
+        np.empty((n_shutters, 4)),
+        np.zeros(max(1, image.shape[3] - N_LOOKS), np.int64),
+        np.zeros(2, np.int64),
+    )
+    for s in range(n_shutters):
+        room.shutter[AREA, s] = integral(colours, s, colours.time[colours.first[s + 1] - 1])
+    interval, cell, layer = 0, 0, 0
+    for p in range(listed.size[0]):
+        pixel, n_intervals, n_cells = listed.pixel[p, 0], listed.pixel[p, 1], listed.pixel[p, 2]
+        row, column = pixel // view.width, pixel % view.width
+        x_ndc = 2 * (column + view.x_px) / view.width - 1
+        y_ndc = 1 - 2 * (row + view.y_px) / view.height
+        for s in range(n_shutters):
+            way = colours.direction[s]
+            line = row if way == DOWN else view.height - 1 - row if way == UP else column
+            if way > RIGHT:
+                line = view.width - 1 - column
+            room.shutter[DELAY, s] = colours.delay[s] * line
+        for k in range(cell, cell + n_cells):
+            n_layers = listed.n_layers[k]
+            if n_layers > len(span.face):
+                span = make_span(2 * n_layers, n_lamps)
+            t_start, t_end = listed.t[k, 0], listed.t[k, 1]
+            varies = False
+            for m in range(n_layers):
+                prism = listed.prism[interval + listed.layer[layer + m]]
+                varies |= stock.flags[stock.face[prism]] & VARYING != 0
+            n_spans = 1
+            if varies:
+                n_spans = _cut(colours, knots, (t_start, t_end), borrowed(room))
+            for part in range(n_spans):
+                start, end = t_start, t_end
+                if n_spans > 1:
+                    a, b = room.ends[part], room.ends[part + 1]
+                    if not b - a > SAME_TIME:
+                        continue
+                    start, end = (1 - a) * t_start + a * t_end, (1 - b) * t_start + b * t_end
+                for m in range(n_layers):
+                    prism = listed.prism[interval + listed.layer[layer + m]]
+                    follow(stock, looks, lit, borrowed(span), (m, prism, x_ndc, y_ndc, start, end))
+                out = image[row, column]
+                if not varies:
+                    _add_flat(borrowed(span), n_layers, (looks, lit, colours), (start, end, borrowed(room)), out)
+                    continue
+                n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
+                if n < 0:
+                    bends = make_bends(-2 * n)
+                    n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
+                _add_varying(
+                    borrowed(span), (n_layers, n, borrowed(bends)), (looks, lit, colours), (start, end, borrowed(room)), out
+                )
+            layer += n_layers
+        interval, cell = interval + n_intervals, cell + n_cells
+    return room.count[0]
+
+
+@inlined
+def _cut(colours: Colours, knots: np.ndarray, times: tuple[float, float], room: Room) -> int:
+    """Write the shares of a cell at which its spans end, and return how many spans there are."""
+    ends = room.ends
+    t_start, t_end = times
+    n = 1
+    ends[0] = 0.0
+    for s in range(len(colours.delay)):
+        for k in range(colours.first[s], colours.first[s + 1]):
+            n = _put(ends, n, (colours.time[k] + room.shutter[DELAY, s] - t_start) / (t_end - t_start))
+    for k in range(len(knots)):
+        n = _put(ends, n, (knots[k] - t_start) / (t_end - t_start))
+    ends[n] = 1.0
+    return n
+
+
+@inlined
+def _put(ends: np.ndarray, n: int, share: float) -> int:
+    """Insert a share of the cell's time, if inside, and return how many there are."""
+    if not (share > 0 and share < 1):
+        return n
+    place = n
+    while ends[place - 1] > share:
+        ends[place] = ends[place - 1]
+        place -= 1
+    ends[place] = share
+    return n + 1
+
+
+@inlined
+def _add_flat(
+    span: Span, n_layers: int, scene: tuple[Looks, Lit, Colours], when: tuple[float, float, Room], out: np.ndarray
+) -> None:
+    """Add what a cell shows in which nothing varies."""
+    looks, lit, colours = scene
+    start, end, room = when
+    shutter = room.shutter
+    for s in range(len(colours.delay)):
+        delay = shutter[DELAY, s]
+        whole = integral(colours, s, end - delay) - integral(colours, s, start - delay)
+        shutter[WEIGHT, s] = whole / shutter[AREA, s]
+    _add_sample(span, n_layers, (looks, lit, colours.cutoff), (0.5, room), out)
+
+
+@inlined
+def _add_sample(
+    span: Span, n_layers: int, scene: tuple[Looks, Lit, float], when: tuple[float, Room], out: np.ndarray
+) -> None:
+    """Add what is seen at a time of a span, front to back, by the shutters' weights."""
+    looks, lit, cutoff = scene
+    tau, room = when
+    weight, seen = room.shutter[WEIGHT], room.seen
+    room.count[0] += 1
+    stamp = room.count[0]
+    red, green, blue, direct, left = 0.0, 0.0, 0.0, 0.0, 1.0
+    for m in range(n_layers):
+        r, g, b, alpha, light = look_at(span, m, (looks, lit), tau)
+        part = left * alpha
+        red, green, blue, direct = red + part * r, green + part * g, blue + part * b, direct + part * light
+        mesh = looks.mesh_of[span.face[m]]
+        if alpha > 0 and seen[mesh] != stamp:
+            seen[mesh] = stamp
+            for s in range(len(out)):
+                out[s, N_LOOKS + mesh] += weight[s]
+        left *= 1 - alpha
+        if not left > cutoff:
+            break
+    for s in range(len(out)):
+        share = weight[s]
+        out[s, 0] += share * red
+        out[s, 1] += share * green
+        out[s, 2] += share * blue
+        out[s, 3] += share * (1 - left)
+        out[s, 4] += share * direct
+        out[s, 5] += share * direct
+
+
+@inlined
+def _weigh_span(colours: Colours, when: tuple[float, float, Room]) -> bool:
+    """Write the shutters' weights at a span's start, and their rise to its end; return whether all are constant."""
+    start, end, room = when
+    middle, is_even = 0.5 * (start + end), True
+    for s in range(len(colours.delay)):
+        delay = room.shutter[DELAY, s]
+        room.shutter[LEVEL, s] = room.shutter[RISE, s] = 0.0
+        for k in range(colours.first[s], colours.first[s + 1] - 1):
+            t0, t1 = colours.time[k], colours.time[k + 1]
+            if not (t0 <= middle - delay <= t1):
+                continue
+            w0, rise = colours.weight[k], colours.weight[k + 1] - colours.weight[k]
+            slope = rise / (t1 - t0) / room.shutter[AREA, s]
+            room.shutter[LEVEL, s] = w0 / room.shutter[AREA, s] + (start - delay - t0) * slope
+            room.shutter[RISE, s] = (end - start) * slope
+            is_even &= rise == 0
+            break
+    return is_even
+
+
+@inlined
+def _add_varying(
+    span: Span,
+    what: tuple[int, int, Bends],
+    scene: tuple[Looks, Lit, Colours],
+    when: tuple[float, float, Room],
+    out: np.ndarray,
+) -> None:
+    """Add what a span shows whose looks vary; `what` is how many layers, how many bends, and these."""
+    n_layers, n_bends, bends = what
+    looks, lit, colours = scene
+    start, end, room = when
+    tau, stack, shutter = bends.tau, room.stack, room.shutter
+    is_even = _weigh_span(colours, when)
+    is_simple = n_layers == 1 and span.level[0, 0] == span.level[0, 1]
+    is_simple &= span.flags[0] & (TEXTURED | LIT | MULTIPLIES) == TEXTURED and looks.opacity[span.face[0]] == 1
+    room.count[1] = 0
+    for k in range(n_bends - 1):
+        if not tau[k + 1] - tau[k] > SAME_TIME:
+            continue
+        stack[0, 0], stack[0, 1], stack[0, 2] = tau[k], tau[k + 1], 0.0
+        top = 1
+        while top > 0:
+            top -= 1
+            a, b, halvings = stack[top, 0], stack[top, 1], stack[top, 2]
+            n = count_nodes(span, n_layers, (looks, lit), (0.5 * (a + b), 0.5 * (b - a)), is_even)
+            if n == 0:
+                if halvings >= FREE_HALVINGS:
+                    room.count[1] += 1
+                if halvings < MAX_HALVINGS and room.count[1] <= MANY:
+                    middle = 0.5 * (a + b)
+                    stack[top, 0], stack[top, 1], stack[top, 2] = middle, b, halvings + 1
+                    stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = a, middle, halvings + 1
+                    top += 2
+                    continue
+                n = COUNTS[-1]
+            if is_simple:
+                _add_panel(span, looks, (a, b, n), (end - start, room), out)
+                continue
+            for j in range(n):
+                at = a + (b - a) * NODE[n, j]
+                share = (b - a) * (end - start) * SHARE[n, j]
+                for s in range(len(out)):
+                    shutter[WEIGHT, s] = share * (shutter[LEVEL, s] + at * shutter[RISE, s])
+                _add_sample(span, n_layers, (looks, lit, colours.cutoff), (at, room), out)
+
+
+@inlined
+def _add_panel(
+    span: Span, looks: Looks, panel: tuple[float, float, int], when: tuple[float, Room], out: np.ndarray
+) -> None:
+    """Add what a panel shows of an opaque layer that is textured and no more: its four texels are the same throughout,
+    and weigh by the moments of the place between them.
+    """
+    a, b, n = panel
+    length, room = when
+    face, level, moment = span.face[0], span.level[0, 0], room.moment
+    mesh = looks.mesh_of[face]
+    width, height = looks.size[level, 0, mesh], looks.size[level, 1, mesh]
+    u, v = place_at(span, 0, 0.5 * (a + b))
+    left, top = np.floor(u * width - 0.5), np.floor((1 - v) * height - 0.5)
+    for s in range(len(moment)):
+        for k in range(4):
+            moment[s, k] = 0.0
+    for j in range(n):
+        at = a + (b - a) * NODE[n, j]
+        u, v = place_at(span, 0, at)
+        x, y = u * width - 0.5 - left, (1 - v) * height - 0.5 - top
+        share = (b - a) * length * SHARE[n, j]
+        for s in range(len(moment)):
+            weight = share * (room.shutter[LEVEL, s] + at * room.shutter[RISE, s])
+            moment[s, 0] += weight
+            moment[s, 1] += weight * x
+            moment[s, 2] += weight * y
+            moment[s, 3] += weight * x * y
+    room.count[0] += n
+    column, row = int(left), int(top)
+    if looks.repeats[mesh]:
+        column0, row0, column1, row1 = column % width, row % height, (column + 1) % width, (row + 1) % height
+    else:
+        column0, row0 = min(max(column, 0), width - 1), min(max(row, 0), height - 1)
+        column1, row1 = min(max(column + 1, 0), width - 1), min(max(row + 1, 0), height - 1)
+    first, texels = looks.first[level, mesh], looks.texels
+    i, j = first + row0 * width + column0, first + row0 * width + column1
+    k, m = first + row1 * width + column0, first + row1 * width + column1
+    for s in range(len(moment)):
+        xy = moment[s, 3]
+        right, below = moment[s, 1] - xy, moment[s, 2] - xy
+        rest = moment[s, 0] - moment[s, 1] - below
+        for c in range(3):
+            total = rest * texels[i, c] + right * texels[j, c] + below * texels[k, c] + xy * texels[m, c]
+            out[s, c] += looks.rgb[face, c] * total
+        out[s, 3] += moment[s, 0]
+        out[s, N_LOOKS + mesh] += moment[s, 0]

@@ -194,7 +194,7 @@ def _cross_cone(span: Span, m: int, lamp: int, cosine: float, to: tuple[Bends, i
     """Add the times at which the point crosses a cone: roots of (V A)^2 - cosine^2 V^2 A^2, or of V A for a plane."""
     bends, count = to
     vector, axis = span.vector[m, lamp], span.axis[lamp]
-    room, square, half = bends.room[0], span.room[SQUARE], span.room[SQUARE + 2]
+    room, square, half = bends.room[0], span.room[SQUARE], span.quartic[:, 0]
     largest = 0.0
     for k in range(5):
         half[k] = 0.0
@@ -216,7 +216,7 @@ def _cross_cone(span: Span, m: int, lamp: int, cosine: float, to: tuple[Bends, i
         return _add_roots(bends, 5, np.sqrt(noise), count)
     rest = span.room[CONE]
     _dot(vector, vector, rest)
-    square_of(span.room[SQUARE + 2 :], 1, 1.0, room)
+    square_of(span.quartic, 1, 1.0, room)
     for k in range(7):
         for j in range(3):
             share = CHOOSE_6[k] * CHOOSE_2[j] / CHOOSE_8[k + j]

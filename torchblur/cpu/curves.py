@@ -1,6 +1,6 @@
 """What the layers of a slice of time do, one ray at a time: paths.py, texture_bends.py and light_bends.py, compiled.
 
-Before: jit.py, lambert.py, layers.py.  After: bends.py, panels.py, expose.py.
+Before: jit.py, lambert.py, layers.py.  After: bends.py, panels.py.
 Symbols: a span is a slice of a cell in which neither the shutter nor a light has a knot; L layers in it; tau in [0, 1]
 is time in the span. All polynomials by their Bernstein coefficients over it: S = e_0 + e_1 + e_2; a place on a texture
 is (U, V) / S; the rows of a footprint's matrix are Q / S^2; N is a normal, V = S (light - point).
@@ -19,7 +19,7 @@ from torchblur.cpu.layers import Looks
 from torchblur.prisms import Prisms
 
 TEXTURED, MIPPED, LIT, NEAR, VARYING, MULTIPLIES = 1, 2, 4, 8, 16, 32  # flags of a layer
-CORNER, EDGE, ACROSS, SQUARE, CONE = 0, 2, 5, 8, 11  # rows of the room
+CORNER, EDGE, ACROSS, SQUARE, CONE = 0, 2, 5, 8, 10  # rows of the room
 
 
 class Stock(NamedTuple):
@@ -44,13 +44,14 @@ class Span(NamedTuple):
     scale: np.ndarray  # (L, 3) S
     uv: np.ndarray  # (L, 2, 3) U and V
     corners: np.ndarray  # (L, 2, 2) least and greatest u and v of the corners
-    slope: np.ndarray  # (L, 4, 5) rows of the footprint's matrix, in texels of level 0
+    slope: np.ndarray  # (L, 5, 4) rows of the footprint's matrix, last, in texels of level 0
     level: np.ndarray  # (L, 2) int64 least and greatest level of lookups
     normal: np.ndarray  # (L, 3, 4)
     side: np.ndarray  # (L, 2) what makes N V the cosine: of lamps that are near, and of directions
     vector: np.ndarray  # (L, lamps, 3, 4)
     axis: np.ndarray  # (lamps, 3, 2) of spots
-    room: np.ndarray  # (12, 12) to work in, see CORNER and following
+    quartic: np.ndarray  # (5, 1) to work in
+    room: np.ndarray  # (11, 12) to work in, see CORNER and following
 
 
 def find_stock(prisms: Prisms) -> Stock:
@@ -85,13 +86,14 @@ def make_span(n_layers: int, n_lamps: int) -> Span:
         np.empty((n, 3)),
         np.empty((n, 2, 3)),
         np.empty((n, 2, 2)),
-        np.empty((n, 4, 5)),
+        np.empty((n, 5, 4)),
         np.zeros((n, 2), ints),
         np.zeros((n, 3, 4)),
         np.empty((n, 2)),
         np.zeros((n, n_lamps, 3, 4)),
         np.zeros((n_lamps, 3, 2)),
-        np.empty((12, 12)),
+        np.empty((5, 1)),
+        np.empty((11, 12)),
     )
 
 
@@ -175,11 +177,11 @@ def _follow_texture(stock: Stock, looks: Looks, span: Span, m: int, prism: int) 
             wide = looks.size[0, axis, mesh] * looks.step[screen]
             row = 2 * screen + axis
             for k in range(5):
-                slope[m, row, k] = 0.0
+                slope[m, k, row] = 0.0
             for i in range(3):
                 value = uv[face, stock.corner[prism, i], axis] * wide
-                _add_product(span.scale[m], across[i], value, slope[m, row])
-                _add_product(span.uv[m, axis], across[i], -wide, slope[m, row])
+                _add_product(span.scale[m], across[i], value, slope[m, :, row])
+                _add_product(span.uv[m, axis], across[i], -wide, slope[m, :, row])
     low, high = _square_range(span, m)
     span.level[m, 0] = min(int(np.floor(0.5 * np.log2(max(low, 1.0)))), last)
     high = 0.5 * np.log2(max(high, 1.0))
@@ -200,11 +202,11 @@ def _add_product(a: np.ndarray, b: np.ndarray, factor: float, out: np.ndarray) -
 
 @inlined
 def square_of(rows: np.ndarray, n: int, share: float, out: np.ndarray) -> None:
-    """Write `share` of the sum of the squares of `n` quartics (n, 5) to `out` (9,)."""
+    """Write `share` of the sum of the squares of `n` quartics (5, n) to `out` (9,)."""
     for k in range(9):
         out[k] = 0.0
     for r in range(n):
-        a, b, c, d, e = rows[r, 0], 4 * rows[r, 1], 6 * rows[r, 2], 4 * rows[r, 3], rows[r, 4]
+        a, b, c, d, e = rows[0, r], 4 * rows[1, r], 6 * rows[2, r], 4 * rows[3, r], rows[4, r]
         out[0] += share * (a * a)
         out[1] += share * (2 * a * b) / 8
         out[2] += share * (2 * a * c + b * b) / 28
@@ -219,10 +221,10 @@ def square_of(rows: np.ndarray, n: int, share: float, out: np.ndarray) -> None:
 @inlined
 def squares(span: Span, m: int) -> None:
     """Write S^4 times the square of a footprint, and S^4, to the rows SQUARE and SQUARE + 1 of the room."""
-    square, fourth, quartic = span.room[SQUARE], span.room[SQUARE + 1], span.room[SQUARE + 2 :]
+    square, fourth, quartic = span.room[SQUARE], span.room[SQUARE + 1], span.quartic
     for k in range(5):
-        quartic[0, k] = 0.0
-    _add_product(span.scale[m], span.scale[m], 1.0, quartic[0])
+        quartic[k, 0] = 0.0
+    _add_product(span.scale[m], span.scale[m], 1.0, quartic[:, 0])
     square_of(quartic, 1, 1.0, fourth)
     square_of(span.slope[m], 4, 0.5, square)
 

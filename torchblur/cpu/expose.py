@@ -18,15 +18,16 @@ from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, TEXTURED, VARYING, Spa
 from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.lambert import Lit
 from torchblur.cpu.layers import Looks
-from torchblur.cpu.panels import count_nodes
-from torchblur.cpu.shine import look_at, place_at
+from torchblur.cpu.panels import Panel, count_nodes, expand, make_panel
+from torchblur.cpu.shine import level_at, look_at, place_at
 from torchblur.cpu.tiles import View
 from torchblur.nodes import COUNTS, FREE_HALVINGS, MANY, MAX_HALVINGS
 from torchblur.sort import SAME_TIME
 
-NODE, SHARE = np.zeros((2, COUNTS[-1] + 1, COUNTS[-1]))  # on [0, 1], and their weights, which add up to 1
+NODE, SHARE = np.zeros((2, COUNTS[-1] + 1, COUNTS[-1]))  # on [-1, 1], and weights that add up to 1
 for _n in range(1, COUNTS[-1] + 1):
-    NODE[_n, :_n], SHARE[_n, :_n] = (0.5 * (a + b) for a, b in zip(np.polynomial.legendre.leggauss(_n), (1, 0)))
+    NODE[_n, :_n], SHARE[_n, :_n] = np.polynomial.legendre.leggauss(_n)
+SHARE *= 0.5
 DELAY, AREA, BEFORE, WEIGHT, LEVEL, RISE, N_ROWS = 0, 1, 2, 3, 4, 5, 6  # of what is kept of each shutter
 
 
@@ -48,7 +49,8 @@ class Room(NamedTuple):
     #                      sample; and over a span the weight at its start and the rise to its end
     ends: np.ndarray  # (most spans + 1,) shares of the cell at which its spans end
     stack: np.ndarray  # (MAX_HALVINGS + 2, 3) panels yet to be done: start, end, halvings
-    moment: np.ndarray  # (S, 4) integrals of 1, x, y, x y over a panel
+    moment: np.ndarray  # (2, S, 4) integrals of 1, x, y, x y over a panel, for the finer and the coarser level
+    corner: np.ndarray  # (2, 2) first column and row of the texels looked up, by level
     seen: np.ndarray  # (M,) int64 sample in which a mesh was seen last
     count: np.ndarray  # (2,) int64 samples, and panels halved often in this span
 
@@ -60,12 +62,13 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
     stock, looks, colours, view = borrowed(scene.stock), borrowed(scene.looks), borrowed(scene.colours), scene.rays
     knots, lit = borrowed(scene.knots), borrowed(scene.lit)
     n_lamps, n_shutters = len(lit.kind), len(colours.delay)
-    span, bends = make_span(8, n_lamps), make_bends(256)
+    span, panel, bends = make_span(8, n_lamps), make_panel(8, n_lamps), make_bends(256)
     room = Room(
         np.zeros((N_ROWS, n_shutters)),
         np.empty(len(colours.time) + len(knots) + 2),
         np.empty((MAX_HALVINGS + 2, 3)),
-        np.empty((n_shutters, 4)),
+        np.empty((2, n_shutters, 4)),
+        np.empty((2, 2)),
         np.zeros(max(1, image.shape[3] - N_LOOKS), np.int64),
         np.zeros(2, np.int64),
     )
@@ -86,7 +89,7 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
         for k in range(cell, cell + n_cells):
             n_layers = listed.n_layers[k]
             if n_layers > len(span.face):
-                span = make_span(2 * n_layers, n_lamps)
+                span, panel = make_span(2 * n_layers, n_lamps), make_panel(2 * n_layers, n_lamps)
             t_start, t_end = listed.t[k, 0], listed.t[k, 1]
             varies = False
             for m in range(n_layers):
@@ -106,16 +109,15 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
                     prism = listed.prism[interval + listed.layer[layer + m]]
                     follow(stock, looks, lit, borrowed(span), (m, prism, x_ndc, y_ndc, start, end))
                 out = image[row, column]
+                what, when = borrowed((span, panel)), (start, end, borrowed(room))
                 if not varies:
-                    _add_flat(borrowed(span), n_layers, (looks, lit, colours), (start, end, borrowed(room)), out)
+                    _add_flat(what, n_layers, (looks, lit, colours), when, out)
                     continue
                 n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
                 if n < 0:
                     bends = make_bends(-2 * n)
                     n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
-                _add_varying(
-                    borrowed(span), (n_layers, n, borrowed(bends)), (looks, lit, colours), (start, end, borrowed(room)), out
-                )
+                _add_varying(what, (n_layers, n, borrowed(bends)), (looks, lit, colours), when, out)
             layer += n_layers
         interval, cell = interval + n_intervals, cell + n_cells
     return room.count[0]
@@ -152,7 +154,11 @@ def _put(ends: np.ndarray, n: int, share: float) -> int:
 
 @inlined
 def _add_flat(
-    span: Span, n_layers: int, scene: tuple[Looks, Lit, Colours], when: tuple[float, float, Room], out: np.ndarray
+    what: tuple[Span, Panel],
+    n_layers: int,
+    scene: tuple[Looks, Lit, Colours],
+    when: tuple[float, float, Room],
+    out: np.ndarray,
 ) -> None:
     """Add what a cell shows in which nothing varies."""
     looks, lit, colours = scene
@@ -162,25 +168,26 @@ def _add_flat(
         delay = shutter[DELAY, s]
         whole = integral(colours, s, end - delay) - integral(colours, s, start - delay)
         shutter[WEIGHT, s] = whole / shutter[AREA, s]
-    _add_sample(span, n_layers, (looks, lit, colours.cutoff), (0.5, room), out)
+    expand(what[0], n_layers, lit, (0.5, 0.5), what[1])
+    _add_sample(what, n_layers, (looks, lit, colours.cutoff), (0.0, room), out)
 
 
 @inlined
 def _add_sample(
-    span: Span, n_layers: int, scene: tuple[Looks, Lit, float], when: tuple[float, Room], out: np.ndarray
+    what: tuple[Span, Panel], n_layers: int, scene: tuple[Looks, Lit, float], when: tuple[float, Room], out: np.ndarray
 ) -> None:
-    """Add what is seen at a time of a span, front to back, by the shutters' weights."""
+    """Add what is seen at a time of a panel, front to back, by the shutters' weights."""
     looks, lit, cutoff = scene
-    tau, room = when
+    time, room = when
     weight, seen = room.shutter[WEIGHT], room.seen
     room.count[0] += 1
     stamp = room.count[0]
     red, green, blue, direct, left = 0.0, 0.0, 0.0, 0.0, 1.0
     for m in range(n_layers):
-        r, g, b, alpha, light = look_at(span, m, (looks, lit), tau)
+        r, g, b, alpha, light = look_at(what[0], what[1], m, (looks, lit), time)
         part = left * alpha
         red, green, blue, direct = red + part * r, green + part * g, blue + part * b, direct + part * light
-        mesh = looks.mesh_of[span.face[m]]
+        mesh = looks.mesh_of[what[0].face[m]]
         if alpha > 0 and seen[mesh] != stamp:
             seen[mesh] = stamp
             for s in range(len(out)):
@@ -221,20 +228,19 @@ def _weigh_span(colours: Colours, when: tuple[float, float, Room]) -> bool:
 
 @inlined
 def _add_varying(
-    span: Span,
-    what: tuple[int, int, Bends],
+    what: tuple[Span, Panel],
+    seen: tuple[int, int, Bends],
     scene: tuple[Looks, Lit, Colours],
     when: tuple[float, float, Room],
     out: np.ndarray,
 ) -> None:
-    """Add what a span shows whose looks vary; `what` is how many layers, how many bends, and these."""
-    n_layers, n_bends, bends = what
-    looks, lit, colours = scene
-    start, end, room = when
+    """Add what a span shows whose looks vary; `seen` is how many layers, how many bends, and these."""
+    n_layers, n_bends, bends = seen
+    (span, panel), (looks, lit, colours), (start, end, room) = what, scene, when
     tau, stack, shutter = bends.tau, room.stack, room.shutter
     is_even = _weigh_span(colours, when)
-    is_simple = n_layers == 1 and span.level[0, 0] == span.level[0, 1]
-    is_simple &= span.flags[0] & (TEXTURED | LIT | MULTIPLIES) == TEXTURED and looks.opacity[span.face[0]] == 1
+    is_simple = n_layers == 1 and span.flags[0] & (TEXTURED | LIT | MULTIPLIES) == TEXTURED
+    is_simple &= looks.opacity[span.face[0]] == 1
     room.count[1] = 0
     for k in range(n_bends - 1):
         if not tau[k + 1] - tau[k] > SAME_TIME:
@@ -244,58 +250,82 @@ def _add_varying(
         while top > 0:
             top -= 1
             a, b, halvings = stack[top, 0], stack[top, 1], stack[top, 2]
-            n = count_nodes(span, n_layers, (looks, lit), (0.5 * (a + b), 0.5 * (b - a)), is_even)
+            middle, half = 0.5 * (a + b), 0.5 * (b - a)
+            expand(span, n_layers, lit, (middle, half), panel)
+            n = count_nodes(span, n_layers, (looks, lit), panel, is_even)
             if n == 0:
                 if halvings >= FREE_HALVINGS:
                     room.count[1] += 1
                 if halvings < MAX_HALVINGS and room.count[1] <= MANY:
-                    middle = 0.5 * (a + b)
                     stack[top, 0], stack[top, 1], stack[top, 2] = middle, b, halvings + 1
                     stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = a, middle, halvings + 1
                     top += 2
                     continue
                 n = COUNTS[-1]
+            part = (middle, half, 2 * half * (end - start))
             if is_simple:
-                _add_panel(span, looks, (a, b, n), (end - start, room), out)
+                _add_panel(what, looks, (n, part), room, out)
                 continue
             for j in range(n):
-                at = a + (b - a) * NODE[n, j]
-                share = (b - a) * (end - start) * SHARE[n, j]
                 for s in range(len(out)):
-                    shutter[WEIGHT, s] = share * (shutter[LEVEL, s] + at * shutter[RISE, s])
-                _add_sample(span, n_layers, (looks, lit, colours.cutoff), (at, room), out)
+                    level = shutter[LEVEL, s] + (middle + half * NODE[n, j]) * shutter[RISE, s]
+                    shutter[WEIGHT, s] = part[2] * SHARE[n, j] * level
+                _add_sample(what, n_layers, (looks, lit, colours.cutoff), (NODE[n, j], room), out)
 
 
 @inlined
 def _add_panel(
-    span: Span, looks: Looks, panel: tuple[float, float, int], when: tuple[float, Room], out: np.ndarray
+    what: tuple[Span, Panel],
+    looks: Looks,
+    nodes: tuple[int, tuple[float, float, float]],
+    room: Room,
+    out: np.ndarray,
 ) -> None:
-    """Add what a panel shows of an opaque layer that is textured and no more: its four texels are the same throughout,
-    and weigh by the moments of the place between them.
+    """Add what a panel shows of an opaque layer that is textured and no more: its texels are the same throughout, and
+    weigh by the moments of the place between them. `nodes` is their number, and middle, half and length of the panel.
     """
-    a, b, n = panel
-    length, room = when
-    face, level, moment = span.face[0], span.level[0, 0], room.moment
+    span, panel = what
+    n, (middle, half, length) = nodes
+    face, fine, moment, shutter = span.face[0], span.level[0, 0], room.moment, room.shutter
     mesh = looks.mesh_of[face]
-    width, height = looks.size[level, 0, mesh], looks.size[level, 1, mesh]
-    u, v = place_at(span, 0, 0.5 * (a + b))
-    left, top = np.floor(u * width - 0.5), np.floor((1 - v) * height - 0.5)
-    for s in range(len(moment)):
-        for k in range(4):
-            moment[s, k] = 0.0
+    last, n_levels = looks.n_levels[mesh] - 1, 1
+    if span.flags[0] & MIPPED:
+        fine = int(level_at(panel, 0, last, 0.0))
+        n_levels = 2 if fine < last else 1
+    u, v = place_at(panel, 0, 0.0)
+    for k in range(n_levels):
+        width, height = looks.size[fine + k, 0, mesh], looks.size[fine + k, 1, mesh]
+        room.corner[k, 0], room.corner[k, 1] = np.floor(u * width - 0.5), np.floor((1 - v) * height - 0.5)
+        for s in range(len(out)):
+            for c in range(4):
+                moment[k, s, c] = 0.0
     for j in range(n):
-        at = a + (b - a) * NODE[n, j]
-        u, v = place_at(span, 0, at)
-        x, y = u * width - 0.5 - left, (1 - v) * height - 0.5 - top
-        share = (b - a) * length * SHARE[n, j]
-        for s in range(len(moment)):
-            weight = share * (room.shutter[LEVEL, s] + at * room.shutter[RISE, s])
-            moment[s, 0] += weight
-            moment[s, 1] += weight * x
-            moment[s, 2] += weight * y
-            moment[s, 3] += weight * x * y
+        node = NODE[n, j]
+        u, v = place_at(panel, 0, node)
+        coarse = level_at(panel, 0, last, node) - fine if n_levels == 2 else 0.0
+        for k in range(n_levels):
+            x = u * looks.size[fine + k, 0, mesh] - 0.5 - room.corner[k, 0]
+            y = (1 - v) * looks.size[fine + k, 1, mesh] - 0.5 - room.corner[k, 1]
+            share = length * SHARE[n, j] * (coarse if k else 1 - coarse)
+            for s in range(len(out)):
+                weight = share * (shutter[LEVEL, s] + (middle + half * node) * shutter[RISE, s])
+                moment[k, s, 0] += weight
+                moment[k, s, 1] += weight * x
+                moment[k, s, 2] += weight * y
+                moment[k, s, 3] += weight * x * y
     room.count[0] += n
-    column, row = int(left), int(top)
+    for k in range(n_levels):
+        _add_texels(looks, (face, mesh, fine + k), (room.corner[k, 0], room.corner[k, 1]), moment[k], out)
+
+
+@inlined
+def _add_texels(
+    looks: Looks, which: tuple[int, int, int], corner: tuple[float, float], moment: np.ndarray, out: np.ndarray
+) -> None:
+    """Add the four texels about a `corner` of the texture of a face, mesh and level, by moments (S, 4)."""
+    face, mesh, level = which
+    width, height = looks.size[level, 0, mesh], looks.size[level, 1, mesh]
+    column, row = int(corner[0]), int(corner[1])
     if looks.repeats[mesh]:
         column0, row0, column1, row1 = column % width, row % height, (column + 1) % width, (row + 1) % height
     else:
@@ -304,7 +334,7 @@ def _add_panel(
     first, texels = looks.first[level, mesh], looks.texels
     i, j = first + row0 * width + column0, first + row0 * width + column1
     k, m = first + row1 * width + column0, first + row1 * width + column1
-    for s in range(len(moment)):
+    for s in range(len(out)):
         xy = moment[s, 3]
         right, below = moment[s, 1] - xy, moment[s, 2] - xy
         rest = moment[s, 0] - moment[s, 1] - below

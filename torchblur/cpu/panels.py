@@ -1,18 +1,20 @@
 """How many of Gauss's nodes a slice of a span needs, certified: what certificate.py says, compiled.
 
-Before: curves.py.  After: expose.py.
-Symbols: a panel is a slice of a span in which no look bends; rest as in certificate.py and curves.py. Where no light
-and no mip level varies their growth is left out of the bound, and that of the shutter where it is constant.
+Before: curves.py.  After: shine.py, expose.py.
+Symbols: a panel is a slice of a span in which no look bends; s in [-1, 1] is time in it; there curves are kept by their
+powers of s. Rest as in certificate.py and curves.py. Where no light and no mip level varies their growth is left out of
+the bound, and that of the shutter where it is constant.
 Source: Trefethen 2013, theorem 19.3; ours.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.certificate import GROWTH, LEVELS, RHO, ROUNDING, SCALE_LIMIT, TOLERANCE, VECTOR_LIMIT
+from torchblur.certificate import GROWTH, LEVELS, ROUNDING, SCALE_LIMIT, TOLERANCE, VECTOR_LIMIT
 from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, NEAR, TEXTURED, VARYING, Span
 from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.lambert import SPOT, Lit
@@ -20,117 +22,164 @@ from torchblur.cpu.layers import Looks
 from torchblur.light_bends import LINEAR
 from torchblur.nodes import COUNTS
 
-RHOS = np.array(RHO)
+RHO = np.array([*(1.6 * 1.25 ** np.arange(40)), 1e5, 1e6, 1e8])
 REACH = np.array([[0.5 * (rho**k + rho**-k) for k in range(5)] for rho in RHO])  # of T_k on the ellipse
-TWICE_LOG = 2 * np.log(RHOS)
-BOUND = np.log(64 / 15 / 2 / (1 - RHOS**-2.0) / TOLERANCE)
-MOST, ENOUGH = float(COUNTS[-1]), 3.0
+TWICE_LOG = 2 * np.log(RHO)
+BOUND = np.log(64 / 15 / 2 / (1 - RHO**-2.0) / TOLERANCE)
+LOG_GROWTH = math.log(GROWTH)
+MOST, ENOUGH, SMALL, STEP = float(COUNTS[-1]), 3.0, 8.0, 5  # nodes; nodes and growth from which smaller ellipses do not
+#                                                             pay; how much smaller the next is that is tried
 N_NODES = np.array([next(c for c in COUNTS if c >= n) for n in range(1, COUNTS[-1] + 1)])  # at least n, from 1 on
-BINOMIAL = np.array([[math.comb(n, k) if k <= n else 0.0 for k in range(5)] for n in range(5)])
+
+
+class Panel(NamedTuple):
+    """The curves of the layers of a span by their powers of s over a panel."""
+
+    scale: np.ndarray  # (L, 3)
+    uv: np.ndarray  # (L, 2, 3)
+    slope: np.ndarray  # (L, 5, 4) power, row
+    normal: np.ndarray  # (L, 4, 3) power, axis
+    vector: np.ndarray  # (L, lamps, 4, 3)
+    axis: np.ndarray  # (lamps, 2, 3)
+
+
+@jit
+def make_panel(n_layers: int, n_lamps: int) -> Panel:
+    """Return room for so many layers under so many lamps."""
+    n = n_layers
+    return Panel(
+        np.zeros((n, 3)),
+        np.zeros((n, 2, 3)),
+        np.zeros((n, 5, 4)),
+        np.zeros((n, 4, 3)),
+        np.zeros((n, n_lamps, 4, 3)),
+        np.zeros((n_lamps, 2, 3)),
+    )
+
+
+@inlined
+def expand(span: Span, n_layers: int, lit: Lit, part: tuple[float, float], panel: Panel) -> None:
+    """Write the curves of a part of the span, given by its middle and half its length."""
+    middle, half = part
+    for m in range(n_layers):
+        flags = span.flags[m]
+        if not flags & (TEXTURED | LIT):
+            continue
+        _quadratic(span.scale[m], middle, half, panel.scale[m])
+        if flags & TEXTURED:
+            _quadratic(span.uv[m, 0], middle, half, panel.uv[m, 0])
+            _quadratic(span.uv[m, 1], middle, half, panel.uv[m, 1])
+        if flags & MIPPED:
+            _quartics(span.slope[m], middle, half, panel.slope[m])
+        if flags & LIT:
+            _cubics(span.normal[m], middle, half, panel.normal[m])
+            for lamp in range(len(lit.kind)):
+                _cubics(span.vector[m, lamp], middle, half, panel.vector[m, lamp])
+                if lit.kind[lamp] == SPOT:
+                    for d in range(3):
+                        change = span.axis[lamp, d, 1] - span.axis[lamp, d, 0]
+                        panel.axis[lamp, 0, d] = span.axis[lamp, d, 0] + middle * change
+                        panel.axis[lamp, 1, d] = half * change
+
+
+@inlined
+def _quadratic(c: np.ndarray, middle: float, half: float, out: np.ndarray) -> None:
+    a, b, v = c[1] - c[0], c[2] - c[1], 1 - middle
+    out[0] = v * (v * c[0] + middle * c[1]) + middle * (v * c[1] + middle * c[2])
+    out[1] = 2 * half * (v * a + middle * b)
+    out[2] = half * half * (b - a)
+
+
+@inlined
+def _cubics(c: np.ndarray, middle: float, half: float, out: np.ndarray) -> None:
+    """Write the powers of three cubics (3, 4) to `out` (4, 3)."""
+    u, v = middle, 1 - middle
+    b0, b1, b2, b3 = v * v * v, 3 * v * v * u, 3 * v * u * u, u * u * u
+    for r in range(3):
+        c0, c1, c2, c3 = c[r, 0], c[r, 1], c[r, 2], c[r, 3]
+        d0, d1, d2 = c1 - c0, c2 - c1, c3 - c2
+        e0, e1 = d1 - d0, d2 - d1
+        out[0, r] = b0 * c0 + b1 * c1 + b2 * c2 + b3 * c3
+        out[1, r] = 3 * half * (v * v * d0 + 2 * v * u * d1 + u * u * d2)
+        out[2, r] = 3 * half * half * (v * e0 + u * e1)
+        out[3, r] = half * half * half * (e1 - e0)
+
+
+@inlined
+def _quartics(c: np.ndarray, middle: float, half: float, out: np.ndarray) -> None:
+    """Write the powers of four quartics (5, 4) to `out` (5, 4)."""
+    u, v = middle, 1 - middle
+    vv, uv, uu = v * v, u * v, u * u
+    h2 = half * half
+    for r in range(4):
+        c0, c1, c2, c3, c4 = c[0, r], c[1, r], c[2, r], c[3, r], c[4, r]
+        d0, d1, d2, d3 = c1 - c0, c2 - c1, c3 - c2, c4 - c3
+        e0, e1, e2 = d1 - d0, d2 - d1, d3 - d2
+        f0, f1 = e1 - e0, e2 - e1
+        out[0, r] = vv * vv * c0 + 4 * vv * uv * c1 + 6 * uv * uv * c2 + 4 * uv * uu * c3 + uu * uu * c4
+        out[1, r] = 4 * half * (vv * v * d0 + 3 * vv * u * d1 + 3 * v * uu * d2 + uu * u * d3)
+        out[2, r] = 6 * h2 * (vv * e0 + 2 * uv * e1 + uu * e2)
+        out[3, r] = 4 * h2 * half * (v * f0 + u * f1)
+        out[4, r] = h2 * h2 * (f1 - f0)
 
 
 @inlined
 def _fits(sizes: tuple[float, float, float, float, float], limit: float, top: int) -> int:
-    """Return the largest ellipse, `top` or smaller, on which a tail is within `limit` of its middle; -1 for none."""
+    """Return the largest ellipse, `top` or smaller, on which a tail of Chebyshev coefficients of these sizes is within
+    `limit` of its middle; -1 for none.
+    """
     c0, c1, c2, c3, c4 = sizes
-    least = ROUNDING * c0
+    least, room = ROUNDING * c0, limit * c0
     c1, c2 = c1 if c1 > least else 0.0, c2 if c2 > least else 0.0
     c3, c4 = c3 if c3 > least else 0.0, c4 if c4 > least else 0.0
-    room = limit * c0
-    while top >= 0:
-        if c1 * REACH[top, 1] + c2 * REACH[top, 2] + c3 * REACH[top, 3] + c4 * REACH[top, 4] <= room:
-            break
-        top -= 1
-    return top
-
-
-@inlined
-def quadratic(c0: float, c1: float, c2: float, middle: float, half: float) -> tuple[float, float, float]:
-    """Return the Chebyshev coefficients of a quadratic on [middle - half, middle + half]."""
-    first, second = c1 - c0, c2 - c1
-    a, b = (1 - middle) * c0 + middle * c1, (1 - middle) * c1 + middle * c2
-    bend = 0.5 * half * half * (second - first)
-    return (1 - middle) * a + middle * b + bend, 2 * half * (b - a), bend
-
-
-@inlined
-def _vector_fits(rows: np.ndarray, n: int, panel: tuple[float, float], limit: float, top: int) -> int:
-    """Return what `_fits` does of a vector of polynomials of `n` coefficients, rows (components, n)."""
-    middle, half = panel
-    s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
-    for r in range(len(rows)):
-        c0, c1, c2, c3 = rows[r, 0], rows[r, 1], rows[r, 2], rows[r, 3]
-        c4 = rows[r, 4] if n == 5 else 0.0
-        power = half
-        v = 1 - middle
-        if n == 5:  # Taylor's coefficients by differences, times powers of `half`
-            d0, d1, d2, d3 = c1 - c0, c2 - c1, c3 - c2, c4 - c3
-            e0, e1, e2 = d1 - d0, d2 - d1, d3 - d2
-            f0, f1 = e1 - e0, e2 - e1
-            a4 = half**4 * (f1 - f0)
-            a3 = 4 * half**3 * (v * f0 + middle * f1)
-            a2 = 6 * half**2 * (v * (v * e0 + middle * e1) + middle * (v * e1 + middle * e2))
-            p0, p1, p2 = v * d0 + middle * d1, v * d1 + middle * d2, v * d2 + middle * d3
-            a1 = 4 * power * (v * (v * p0 + middle * p1) + middle * (v * p1 + middle * p2))
-            q0, q1, q2, q3 = v * c0 + middle * c1, v * c1 + middle * c2, v * c2 + middle * c3, v * c3 + middle * c4
-            q0, q1, q2 = v * q0 + middle * q1, v * q1 + middle * q2, v * q2 + middle * q3
-            q0, q1 = v * q0 + middle * q1, v * q1 + middle * q2
-            a0 = v * q0 + middle * q1
+    low, high = -1, top + 1  # fits, does not
+    while high - low > 1:
+        place = (low + high) >> 1 if high <= top else top
+        tail = c1 * REACH[place, 1] + c2 * REACH[place, 2] + c3 * REACH[place, 3] + c4 * REACH[place, 4]
+        if tail <= room:
+            low = place
         else:
-            d0, d1, d2 = c1 - c0, c2 - c1, c3 - c2
-            e0, e1 = d1 - d0, d2 - d1
-            a4 = 0.0
-            a3 = half**3 * (e1 - e0)
-            a2 = 3 * half**2 * (v * e0 + middle * e1)
-            a1 = 3 * power * (v * (v * d0 + middle * d1) + middle * (v * d1 + middle * d2))
-            q0, q1, q2 = v * c0 + middle * c1, v * c1 + middle * c2, v * c2 + middle * c3
-            q0, q1 = v * q0 + middle * q1, v * q1 + middle * q2
-            a0 = v * q0 + middle * q1
-        t0, t1, t2, t3, t4 = a0 + a2 / 2 + a4 * 3 / 8, a1 + a3 * 3 / 4, a2 / 2 + a4 / 2, a3 / 4, a4 / 8
+            high = place
+    return low
+
+
+@inlined
+def _vectors_fit(rows: np.ndarray, n: int, limit: float, top: int) -> int:
+    """Return what `_fits` does of vectors by their powers, (4 or 5 powers, n)."""
+    s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
+    for r in range(n):
+        a0, a1, a2, a3 = rows[0, r], rows[1, r], rows[2, r], rows[3, r]
+        a4 = rows[4, r] if len(rows) == 5 else 0.0
+        t0, t1, t2, t3, t4 = a0 + a2 / 2 + a4 * 0.375, a1 + a3 * 0.75, 0.5 * (a2 + a4), 0.25 * a3, 0.125 * a4
         s0, s1, s2, s3, s4 = s0 + t0 * t0, s1 + t1 * t1, s2 + t2 * t2, s3 + t3 * t3, s4 + t4 * t4
     return _fits((np.sqrt(s0), np.sqrt(s1), np.sqrt(s2), np.sqrt(s3), np.sqrt(s4)), limit, top)
 
 
 @inlined
-def _light_fits(span: Span, m: int, lit: Lit, panel: tuple[float, float], top: int) -> int:
+def _light_fits(panel: Panel, m: int, lit: Lit, top: int) -> int:
     """Return the largest ellipse on which the light on a layer is analytic."""
-    top = _vector_fits(span.normal[m], 4, panel, VECTOR_LIMIT, top)
+    top = _vectors_fit(panel.normal[m], 3, VECTOR_LIMIT, top)
     for lamp in range(len(lit.kind)):
         limit = VECTOR_LIMIT
         if lit.kind[lamp] == SPOT:
-            limit = _cone_limit(span, m, lit, lamp, panel[0])
+            limit = _cone_limit(panel, m, lit, lamp)
             if limit == np.inf:
                 continue
-            top = _axis_fits(span.axis[lamp], panel, limit, top)
-        top = _vector_fits(span.vector[m, lamp], 4, panel, limit, top)
+            size, change = 0.0, 0.0
+            for d in range(3):
+                size += panel.axis[lamp, 0, d] ** 2
+                change += panel.axis[lamp, 1, d] ** 2
+            top = _fits((np.sqrt(size), np.sqrt(change), 0.0, 0.0, 0.0), limit, top)
+        top = _vectors_fit(panel.vector[m, lamp], 3, limit, top)
     return top
 
 
 @inlined
-def _axis_fits(axis: np.ndarray, panel: tuple[float, float], limit: float, top: int) -> int:
-    middle, half = panel
-    size, change = 0.0, 0.0
-    for d in range(3):
-        size += (axis[d, 0] + middle * (axis[d, 1] - axis[d, 0])) ** 2
-        change += (half * (axis[d, 1] - axis[d, 0])) ** 2
-    return _fits((np.sqrt(size), np.sqrt(change), 0.0, 0.0, 0.0), limit, top)
-
-
-@inlined
-def cubic(c: np.ndarray, tau: float) -> float:
-    """Return the value at `tau` of four coefficients."""
-    v = 1 - tau
-    a, b, d = v * c[0] + tau * c[1], v * c[1] + tau * c[2], v * c[2] + tau * c[3]
-    return v * (v * a + tau * b) + tau * (v * b + tau * d)
-
-
-@inlined
-def _cone_limit(span: Span, m: int, lit: Lit, lamp: int, tau: float) -> float:
-    """Return by what share vectors to a spot may vary about `tau`; see light_bends.py."""
+def _cone_limit(panel: Panel, m: int, lit: Lit, lamp: int) -> float:
+    """Return by what share vectors to a spot may vary; see light_bends.py."""
     along, of_vector, of_axis = 0.0, 0.0, 0.0
     for d in range(3):
-        v = cubic(span.vector[m, lamp, d], tau)
-        a = span.axis[lamp, d, 0] + tau * (span.axis[lamp, d, 1] - span.axis[lamp, d, 0])
+        v, a = panel.vector[m, lamp, 0, d], panel.axis[lamp, 0, d]
         along, of_vector, of_axis = along + v * a, of_vector + v * v, of_axis + a * a
     size = np.sqrt(of_vector * of_axis)
     cosine = abs(along) / size if size > 0 else abs(along)
@@ -141,67 +190,64 @@ def _cone_limit(span: Span, m: int, lit: Lit, lamp: int, tau: float) -> float:
 
 
 @inlined
-def count_nodes(
-    span: Span, n_layers: int, scene: tuple[Looks, Lit], panel: tuple[float, float], is_even: bool
-) -> int:
+def count_nodes(span: Span, n_layers: int, scene: tuple[Looks, Lit], panel: Panel, is_even: bool) -> int:
     """Return how many nodes bring a panel below the tolerance, of COUNTS; 0 where none are certain to.
 
     Args:
         span, n_layers: what is seen.
         scene: what there is.
-        panel: its middle and half its length, in the span's time.
+        panel: its curves.
         is_even: whether the shutter is constant.
     """
     looks, lit = scene
-    middle, half = panel
     top, grows = len(RHO) - 1, False
     for m in range(n_layers):
         flags = span.flags[m]
         if not flags & VARYING:
             continue
         if flags & (TEXTURED | NEAR):
-            s0, s1, s2 = quadratic(span.scale[m, 0], span.scale[m, 1], span.scale[m, 2], middle, half)
-            top = _fits((abs(s0), abs(s1), abs(s2), 0.0, 0.0), SCALE_LIMIT, top)
+            s0, s1, s2 = panel.scale[m, 0], panel.scale[m, 1], panel.scale[m, 2]
+            top = _fits((abs(s0 + s2 / 2), abs(s1), abs(s2 / 2), 0.0, 0.0), SCALE_LIMIT, top)
         if flags & MIPPED:
-            top = _vector_fits(span.slope[m], 5, panel, VECTOR_LIMIT, top)
+            top = _vectors_fit(panel.slope[m], 4, VECTOR_LIMIT, top)
             grows = True
         if flags & LIT:
-            top = _light_fits(span, m, lit, panel, top)
+            top = _light_fits(panel, m, lit, top)
             grows = True
         if top < 0:
             return 0
     best, rho = np.inf, top
     while rho >= 0:
-        growth = 0.0 if is_even else math.log1p(RHOS[rho] / 2)
-        growth += _growth(span, n_layers, looks, panel, rho) + (math.log(GROWTH) if grows else 0.0)
+        growth = _growth(span, n_layers, looks, panel, rho)
+        growth = math.log(growth if is_even else growth * (1 + RHO[rho] / 2)) + (LOG_GROWTH if grows else 0.0)
         best = min(best, (growth + BOUND[rho]) / TWICE_LOG[rho])
-        if best <= ENOUGH:  # smaller ellipses seldom ask for less
+        if best <= ENOUGH or growth < SMALL:
             break
-        rho -= 3
+        rho -= STEP
     return N_NODES[max(int(np.ceil(best)), 1) - 1] if best <= MOST else 0
 
 
 @inlined
-def _growth(span: Span, n_layers: int, looks: Looks, panel: tuple[float, float], rho: int) -> float:
-    """Return the logarithm of what lookups grow by on an ellipse: colours one at a time, times opacities."""
-    middle, half = panel
-    most, total = 1.0, 0.0
+def _growth(span: Span, n_layers: int, looks: Looks, panel: Panel, rho: int) -> float:
+    """Return what lookups grow by on an ellipse: colours one at a time, times opacities."""
+    most, total = 1.0, 1.0
     for m in range(n_layers):
         flags = span.flags[m]
         if not (flags & VARYING and flags & TEXTURED):
             continue
         mesh, level = looks.mesh_of[span.face[m]], span.level[m, 0]
-        s0, s1, s2 = quadratic(span.scale[m, 0], span.scale[m, 1], span.scale[m, 2], middle, half)
+        s0, s1, s2 = panel.scale[m, 0] + panel.scale[m, 2] / 2, panel.scale[m, 1], panel.scale[m, 2] / 2
+        inverse = 1 / s0 if s0 != 0 else 1.0
         product = 1.0
         for axis in range(2):
-            size = float(looks.size[level, axis, mesh])
-            p0, p1, p2 = quadratic(span.uv[m, axis, 0], span.uv[m, axis, 1], span.uv[m, axis, 2], middle, half)
-            ratio = p0 / s0 if s0 != 0 else p0
+            p2 = panel.uv[m, axis, 2] / 2
+            p0, p1 = panel.uv[m, axis, 0] + p2, panel.uv[m, axis, 1]
+            ratio = p0 * inverse
             a1, a2, least = abs(p1 - ratio * s1), abs(p2 - ratio * s2), ROUNDING * abs(p0)
             a1, a2 = a1 if a1 > least else 0.0, a2 if a2 > least else 0.0
-            away = size * (a1 * REACH[rho, 1] + a2 * REACH[rho, 2])
-            product *= 1 + 2 * away / (abs(s0) if s0 != 0 else 1.0)
+            away = (a1 * REACH[rho, 1] + a2 * REACH[rho, 2]) * abs(inverse)
+            product *= 1 + 2 * away * looks.size[level, axis, mesh]
         most = max(most, product)
         if flags & MULTIPLIES:
-            total += math.log(product * LEVELS)
-    return total + math.log(most)
+            total *= product * LEVELS
+    return total * most

@@ -1,7 +1,7 @@
-"""What a layer of a span looks like at a time, one ray at a time: shading.py and lighting.py, compiled.
+"""What a layer looks like at a time of a panel, one ray at a time: shading.py and lighting.py, compiled.
 
-Before: curves.py.  After: expose.py.
-Symbols as in curves.py.
+Before: panels.py.  After: expose.py.
+Symbols as in panels.py.
 Source: as lighting.py, lights.py and texture.py.
 """
 
@@ -12,72 +12,66 @@ import math
 import numpy as np
 
 from torchblur.cpu.curves import LIT, MIPPED, TEXTURED, Span
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined
 from torchblur.cpu.lambert import DIRECTIONAL, SPOT, Lit
 from torchblur.cpu.layers import FULL, Looks, lookup
-from torchblur.cpu.panels import cubic
+from torchblur.cpu.panels import Panel
 
 Seen = tuple[float, float, float, float, float]
 
 
 @inlined
-def parabola(c0: float, c1: float, c2: float, tau: float) -> float:
-    """Return the value at `tau` of three coefficients."""
-    v = 1 - tau
-    return v * (v * c0 + tau * c1) + tau * (v * c1 + tau * c2)
+def place_at(panel: Panel, m: int, s: float) -> tuple[float, float]:
+    """Return the texture coordinates at `s`; of a face that is a line, those of the corners are taken as alike."""
+    scale, uv = panel.scale, panel.uv
+    inverse = scale[m, 0] + s * (scale[m, 1] + s * scale[m, 2])
+    inverse = 1 / inverse if inverse != 0 else 0.0
+    u = uv[m, 0, 0] + s * (uv[m, 0, 1] + s * uv[m, 0, 2])
+    v = uv[m, 1, 0] + s * (uv[m, 1, 1] + s * uv[m, 1, 2])
+    return u * inverse, v * inverse
 
 
 @inlined
-def place_at(span: Span, m: int, tau: float) -> tuple[float, float]:
-    """Return the texture coordinates at `tau`; of a face that is a line, those of its middle."""
-    scale = parabola(span.scale[m, 0], span.scale[m, 1], span.scale[m, 2], tau)
-    if scale == 0:
-        return 0.5 * (span.corners[m, 0, 0] + span.corners[m, 0, 1]), 0.5 * (
-            span.corners[m, 1, 0] + span.corners[m, 1, 1]
-        )
-    u = parabola(span.uv[m, 0, 0], span.uv[m, 0, 1], span.uv[m, 0, 2], tau)
-    v = parabola(span.uv[m, 1, 0], span.uv[m, 1, 1], span.uv[m, 1, 2], tau)
-    return u / scale, v / scale
-
-
-@inlined
-def level_at(span: Span, m: int, last: int, tau: float) -> float:
-    """Return the mip level at `tau`, from 0 to `last`."""
-    scale = parabola(span.scale[m, 0], span.scale[m, 1], span.scale[m, 2], tau)
+def level_at(panel: Panel, m: int, last: int, s: float) -> float:
+    """Return the mip level at `s`, from 0 to `last`."""
+    square, slope = 0.0, panel.slope
+    for row in range(4):
+        value = slope[m, 3, row] + s * slope[m, 4, row]
+        value = slope[m, 0, row] + s * (slope[m, 1, row] + s * (slope[m, 2, row] + s * value))
+        square += value * value
+    scale = panel.scale[m, 0] + s * (panel.scale[m, 1] + s * panel.scale[m, 2])
     if scale == 0:
         return 0.0
-    v, square = 1 - tau, 0.0
-    w0, w1, w2, w3, w4 = v**4, 4 * v**3 * tau, 6 * v * v * tau * tau, 4 * v * tau**3, tau**4
-    for row in range(4):
-        s = span.slope[m, row]
-        value = w0 * s[0] + w1 * s[1] + w2 * s[2] + w3 * s[3] + w4 * s[4]
-        square += value * value
-    return min(0.5 * math.log2(max(0.5 * square / scale**4, 1.0)), float(last))
+    scale *= scale
+    return min(0.5 * math.log2(max(0.5 * square / (scale * scale), 1.0)), float(last))
 
 
 @inlined
-def look_at(span: Span, m: int, scene: tuple[Looks, Lit], tau: float) -> Seen:
-    """Return straight RGB, opacity, and the direct light, of a layer at `tau`."""
+def look_at(span: Span, panel: Panel, m: int, scene: tuple[Looks, Lit], s: float) -> Seen:
+    """Return straight RGB, opacity, and the direct light, of a layer at a time `s` of a panel."""
     looks, lit = scene
     face, flags = span.face[m], span.flags[m]
     red, green, blue, alpha = looks.rgb[face, 0], looks.rgb[face, 1], looks.rgb[face, 2], looks.opacity[face]
     direct = 0.0
     if flags & TEXTURED:
-        u, v = place_at(span, m, tau)
+        u, v = place_at(panel, m, s)
         mesh, level = looks.mesh_of[face], 0.0
         if flags & MIPPED:
-            level = level_at(span, m, looks.n_levels[mesh] - 1, tau)
+            level = level_at(panel, m, looks.n_levels[mesh] - 1, s)
         r, g, b, a = lookup(looks, mesh, u, v, level)
         red, green, blue, alpha = red * r, green * g, blue * b, alpha * (1.0 if a > 1 - FULL else a)
     if flags & LIT:
-        (r, g, b), direct = shine(span, m, lit, tau)
+        (r, g, b), direct = shine(span, panel, m, lit, s)
         red, green, blue = red * r, green * g, blue * b
     return red, green, blue, alpha, direct
 
 
 @inlined
-def _at(rows: np.ndarray, tau: float) -> tuple[float, float, float]:
-    return cubic(rows[0], tau), cubic(rows[1], tau), cubic(rows[2], tau)
+def _at(rows: np.ndarray, s: float) -> tuple[float, float, float]:
+    """Return the vector at `s` of which the powers are given (4, 3)."""
+    x = rows[0, 0] + s * (rows[1, 0] + s * (rows[2, 0] + s * rows[3, 0]))
+    y = rows[0, 1] + s * (rows[1, 1] + s * (rows[2, 1] + s * rows[3, 1]))
+    return x, y, rows[0, 2] + s * (rows[1, 2] + s * (rows[2, 2] + s * rows[3, 2]))
 
 
 @inlined
@@ -91,18 +85,18 @@ def _size(x: float, y: float, z: float) -> float:
 
 
 @inlined
-def shine(span: Span, m: int, lit: Lit, tau: float) -> tuple[tuple[float, float, float], float]:
-    """Return what to multiply the colour of a lit layer by at `tau`, and the direct light in it, summed over RGB."""
-    scale = parabola(span.scale[m, 0], span.scale[m, 1], span.scale[m, 2], tau)
+def shine(span: Span, panel: Panel, m: int, lit: Lit, s: float) -> tuple[tuple[float, float, float], float]:
+    """Return what to multiply the colour of a lit layer by at `s`, and the direct light in it, summed over RGB."""
+    scale = panel.scale[m, 0] + s * (panel.scale[m, 1] + s * panel.scale[m, 2])
     red, green, blue, direct = lit.ambient[0], lit.ambient[1], lit.ambient[2], 0.0
-    nx, ny, nz = _at(span.normal[m], tau)
+    nx, ny, nz = _at(panel.normal[m], s)
     of_normal = _size(nx, ny, nz)
     if of_normal == 0 or scale == 0:
         return (red, green, blue), direct
     nx, ny, nz = nx / of_normal, ny / of_normal, nz / of_normal
     for lamp in range(len(lit.kind)):
         kind = lit.kind[lamp]
-        x, y, z = _at(span.vector[m, lamp], tau)
+        x, y, z = _at(panel.vector[m, lamp], s)
         length = _size(x, y, z)
         if length == 0:
             continue
@@ -114,7 +108,7 @@ def shine(span: Span, m: int, lit: Lit, tau: float) -> tuple[tuple[float, float,
         if kind != DIRECTIONAL:
             share *= (scale / length) ** 2
         if kind == SPOT:
-            share *= _in_cone(span, lit, lamp, tau, (x, y, z, np.sign(scale)))
+            share *= _in_cone(panel, lit, lamp, s, (x, y, z, np.sign(scale)))
         red += share * lit.power[lamp, 0]
         green += share * lit.power[lamp, 1]
         blue += share * lit.power[lamp, 2]
@@ -123,12 +117,10 @@ def shine(span: Span, m: int, lit: Lit, tau: float) -> tuple[tuple[float, float,
 
 
 @inlined
-def _in_cone(span: Span, lit: Lit, lamp: int, tau: float, toward: tuple[float, float, float, float]) -> float:
+def _in_cone(panel: Panel, lit: Lit, lamp: int, s: float, toward: tuple[float, float, float, float]) -> float:
     """Return the share of a spot's light in the direction from it; `toward` is to it, but for the sign of S."""
-    axis = span.axis[lamp]
-    x = axis[0, 0] + tau * (axis[0, 1] - axis[0, 0])
-    y = axis[1, 0] + tau * (axis[1, 1] - axis[1, 0])
-    z = axis[2, 0] + tau * (axis[2, 1] - axis[2, 0])
+    axis = panel.axis[lamp]
+    x, y, z = axis[0, 0] + s * axis[1, 0], axis[0, 1] + s * axis[1, 1], axis[0, 2] + s * axis[1, 2]
     size = _size(x, y, z)
     if size == 0:
         size = 1.0

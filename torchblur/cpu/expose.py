@@ -52,7 +52,7 @@ class Room(NamedTuple):
     moment: np.ndarray  # (2, S, 4) integrals of 1, x, y, x y over a panel, for the finer and the coarser level
     corner: np.ndarray  # (2, 2) first column and row of the texels looked up, by level
     seen: np.ndarray  # (M,) int64 sample in which a mesh was seen last
-    count: np.ndarray  # (2,) int64 samples, and panels halved often in this span
+    count: np.ndarray  # (3,) int64 samples, panels halved often in this span, and the last panel's ellipse
 
 
 @jit
@@ -70,7 +70,7 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
         np.empty((2, n_shutters, 4)),
         np.empty((2, 2)),
         np.zeros(max(1, image.shape[3] - N_LOOKS), np.int64),
-        np.zeros(2, np.int64),
+        np.zeros(3, np.int64),
     )
     for s in range(n_shutters):
         room.shutter[AREA, s] = integral(colours, s, colours.time[colours.first[s + 1] - 1])
@@ -252,7 +252,7 @@ def _add_varying(
             a, b, halvings = stack[top, 0], stack[top, 1], stack[top, 2]
             middle, half = 0.5 * (a + b), 0.5 * (b - a)
             expand(span, n_layers, lit, (middle, half), panel)
-            n = count_nodes(span, n_layers, (looks, lit), panel, is_even)
+            n, room.count[2] = count_nodes(span, n_layers, (looks, lit), panel, (is_even, room.count[2]))
             if n == 0:
                 if halvings >= FREE_HALVINGS:
                     room.count[1] += 1

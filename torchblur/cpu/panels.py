@@ -9,7 +9,6 @@ Source: Trefethen 2013, theorem 19.3; ours.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,14 +21,14 @@ from torchblur.cpu.layers import Looks
 from torchblur.light_bends import LINEAR
 from torchblur.nodes import COUNTS
 
-RHO = np.array([*(1.6 * 1.25 ** np.arange(40)), 1e5, 1e6, 1e8])
+LEAST, RATIO = 1.6, 1.25
+RHO = LEAST * RATIO ** np.arange(81)
 REACH = np.array([[0.5 * (rho**k + rho**-k) for k in range(5)] for rho in RHO])  # of T_k on the ellipse
-TWICE_LOG = 2 * np.log(RHO)
-BOUND = np.log(64 / 15 / 2 / (1 - RHO**-2.0) / TOLERANCE)
-LOG_GROWTH = math.log(GROWTH)
-MOST, ENOUGH, SMALL, STEP = float(COUNTS[-1]), 3.0, 8.0, 5  # nodes; nodes and growth from which smaller ellipses do not
-#                                                             pay; how much smaller the next is that is tried
-N_NODES = np.array([next(c for c in COUNTS if c >= n) for n in range(1, COUNTS[-1] + 1)])  # at least n, from 1 on
+# what looks may grow by on an ellipse for n nodes to err by no more than the tolerance
+ROOM = np.array([[rho ** (2 * n) / (64 / 15 / 2 / (1 - rho**-2) / TOLERANCE) for n in range(17)] for rho in RHO])
+CLIMB = 4  # how much larger an ellipse may be than the one of the panel before
+ENOUGH, SMALL, STEP = 3, 3000.0, 5  # nodes, and growth, from which smaller ellipses do not pay; the step to the next
+ROUND_UP = np.array([next(c for c in COUNTS if c >= n) for n in range(1, COUNTS[-1] + 1)])  # of n - 1
 
 
 class Panel(NamedTuple):
@@ -132,15 +131,11 @@ def _fits(sizes: tuple[float, float, float, float, float], limit: float, top: in
     least, room = ROUNDING * c0, limit * c0
     c1, c2 = c1 if c1 > least else 0.0, c2 if c2 > least else 0.0
     c3, c4 = c3 if c3 > least else 0.0, c4 if c4 > least else 0.0
-    low, high = -1, top + 1  # fits, does not
-    while high - low > 1:
-        place = (low + high) >> 1 if high <= top else top
-        tail = c1 * REACH[place, 1] + c2 * REACH[place, 2] + c3 * REACH[place, 3] + c4 * REACH[place, 4]
-        if tail <= room:
-            low = place
-        else:
-            high = place
-    return low
+    while top >= 0:
+        if c1 * REACH[top, 1] + c2 * REACH[top, 2] + c3 * REACH[top, 3] + c4 * REACH[top, 4] <= room:
+            break
+        top -= 1
+    return top
 
 
 @inlined
@@ -190,17 +185,21 @@ def _cone_limit(panel: Panel, m: int, lit: Lit, lamp: int) -> float:
 
 
 @inlined
-def count_nodes(span: Span, n_layers: int, scene: tuple[Looks, Lit], panel: Panel, is_even: bool) -> int:
-    """Return how many nodes bring a panel below the tolerance, of COUNTS; 0 where none are certain to.
+def count_nodes(
+    span: Span, n_layers: int, scene: tuple[Looks, Lit], panel: Panel, how: tuple[bool, int]
+) -> tuple[int, int]:
+    """Return how many nodes bring a panel below the tolerance, of COUNTS, or 0 where none are certain to; and the
+    ellipse that was found.
 
     Args:
         span, n_layers: what is seen.
         scene: what there is.
         panel: its curves.
-        is_even: whether the shutter is constant.
+        how: whether the shutter is constant, and the ellipse of another panel, from near which to look.
     """
     looks, lit = scene
-    top, grows = len(RHO) - 1, False
+    is_even, top = how
+    top, grows = min(top + CLIMB, len(RHO) - 1), False
     for m in range(n_layers):
         flags = span.flags[m]
         if not flags & VARYING:
@@ -215,16 +214,19 @@ def count_nodes(span: Span, n_layers: int, scene: tuple[Looks, Lit], panel: Pane
             top = _light_fits(panel, m, lit, top)
             grows = True
         if top < 0:
-            return 0
-    best, rho = np.inf, top
+            return 0, 0
+    best, rho = len(ROUND_UP) + 1, top
     while rho >= 0:
-        growth = _growth(span, n_layers, looks, panel, rho)
-        growth = math.log(growth if is_even else growth * (1 + RHO[rho] / 2)) + (LOG_GROWTH if grows else 0.0)
-        best = min(best, (growth + BOUND[rho]) / TWICE_LOG[rho])
+        growth = _growth(span, n_layers, looks, panel, rho) * (GROWTH if grows else 1.0)
+        growth *= 1.0 if is_even else 1 + RHO[rho] / 2
+        n = 1
+        while n < best and growth > ROOM[rho, n]:
+            n += 1
+        best = n
         if best <= ENOUGH or growth < SMALL:
             break
         rho -= STEP
-    return N_NODES[max(int(np.ceil(best)), 1) - 1] if best <= MOST else 0
+    return ROUND_UP[best - 1] if best <= len(ROUND_UP) else 0, top
 
 
 @inlined

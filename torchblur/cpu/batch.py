@@ -19,7 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.polynomials import restrict_cubic
 from torchblur.edges import EDGE_SIGN, FIRST, SECOND
 
@@ -53,7 +53,7 @@ class Batch(NamedTuple):
     pixels: np.ndarray  # (ROOM,) int64 columns of the tile in a row
 
 
-@jit
+@inner
 def make_batch() -> Batch:
     """Return room for a batch."""
     return Batch(
@@ -87,7 +87,7 @@ def _product(e: tuple[float, float, float], q: tuple[float, float]) -> tuple[flo
     return e0 * a, 1 / 3 * (e0 * b) + 2 / 3 * (e1 * a), 2 / 3 * (e1 * b) + 1 / 3 * (e2 * a), e2 * b
 
 
-@jit
+@inner
 def set_up(
     clip: np.ndarray, k: int, tile: tuple[float, float, float, float], orders_by_w: bool, out: tuple[np.ndarray, int]
 ) -> None:
@@ -150,7 +150,7 @@ def set_up(
     setup[row, SIZE_AT] = max(max(sizes[0], sizes[1]), max(sizes[2], sizes[3]))
 
 
-@jit
+@inner
 def add_row(
     room: tuple[np.ndarray, np.ndarray, np.ndarray],
     n: int,
@@ -235,7 +235,7 @@ def _inside(
     return start, end, is_split
 
 
-@jit
+@inner
 def solve(field: np.ndarray, n: int) -> None:
     """Set START, END and STATE of `n` pairs: inside, all three edges have one sign."""
     for k in range(_U(n)):
@@ -260,7 +260,7 @@ def solve(field: np.ndarray, n: int) -> None:
         field[k + STATE] = HARD if is_hard else ONE_PIECE if is_front | is_back else 0.0
 
 
-@jit
+@inner
 def gather_covered(batch: Batch, n: int) -> int:
     """List the pairs of a batch of `n` that cover one piece of time, set up their nearness, and return their number."""
     field, near, setup, who, covered = batch.field, batch.near, batch.setup, batch.who, batch.covered
@@ -288,7 +288,7 @@ def _bounds(c0: float, c1: float, c2: float, c3: float) -> tuple[float, float, f
     return low, high, max(abs(low), abs(high))
 
 
-@jit
+@inner
 def restrict(near: np.ndarray, n: int) -> None:
     """Restrict the M and D of `n` pairs to FROM and TO, bound the nearness, and mark those that cancel as WEAK."""
     for k in range(_U(n)):

@@ -13,7 +13,7 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.curves import CONE, LIT, MIPPED, SQUARE, TEXTURED, VARYING, Span, square_of, squares
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import SPOT, Lit
 from torchblur.cpu.layers import Looks
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
@@ -33,7 +33,7 @@ class Bends(NamedTuple):
     found: np.ndarray  # (MAX_DEGREE,)
 
 
-@jit
+@inner
 def make_bends(n: int) -> Bends:
     """Return room for so many times."""
     return Bends(np.empty(n), np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
@@ -122,7 +122,7 @@ def _cross_lines(span: Span, m: int, looks: Looks, tau: np.ndarray, count: int) 
     return count
 
 
-@jit
+@inner
 def _add_roots(bends: Bends, n: int, noise: float, count: int) -> int:
     """Add the roots of the polynomial of `n` coefficients in the first row of the room."""
     for k in range(roots_of(bends.room, n, noise, bends.found)):

@@ -15,7 +15,7 @@ from torchblur.cells import MIN_CELL
 from torchblur.cpu.batch import make_batch
 from torchblur.cpu.coverage import make_work
 from torchblur.cpu.fill import fill_tile
-from torchblur.cpu.jit import borrowed, jit
+from torchblur.cpu.jit import borrowed, inner, jit
 from torchblur.cpu.sweep import N_NUMBERS, NO_ROOM, PRISM, Cells, Ray, make_cells, make_ray, make_solver, sweep
 from torchblur.cpu.tiles import TILE_PX, Geometry, View, count_ray, gather_ray, make_tile
 
@@ -51,7 +51,7 @@ class Listed(NamedTuple):
     size: np.ndarray  # (4,) int64 pixels, intervals, cells, layers
 
 
-@jit
+@inner
 def integral(colours: Colours, s: int, t: float) -> float:
     """Return the weight of shutter `s` before a time of its first line; see `Shutter.weight`. Not yet divided."""
     total, first, time, weight = 0.0, colours.first, colours.time, colours.weight
@@ -64,7 +64,7 @@ def integral(colours: Colours, s: int, t: float) -> float:
     return total
 
 
-@jit
+@inner
 def _composite(
     colours: Colours,
     ray: Ray,
@@ -118,7 +118,7 @@ def _composite(
             image[row, column, s, 3] += delays[2, s] * (1 - left)
 
 
-@jit
+@inner
 def _make_listed(n: int) -> Listed:
     """Return room for so many pixels, intervals, cells and layers."""
     ints = np.int64
@@ -133,7 +133,7 @@ def _make_listed(n: int) -> Listed:
     )
 
 
-@jit
+@inner
 def _with_room(listed: Listed, n: int) -> Listed:
     """Return the listed with room for `n` of everything."""
     room = len(listed.layer)
@@ -156,7 +156,7 @@ def _with_room(listed: Listed, n: int) -> Listed:
     return bigger
 
 
-@jit
+@inner
 def _list(listed: Listed, ray: Ray, n: int, seen_in: tuple[Cells, int], pixel: int) -> Listed:
     """Append the intervals and the cells of a ray."""
     cells, count = seen_in

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inner
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
 from torchblur.edges import CLIP_NOISE, FIRST, SECOND
 
@@ -35,7 +35,7 @@ class Work(NamedTuple):
     ends: np.ndarray  # (2, 3, 4) corners at the ends of a piece
 
 
-@jit
+@inner
 def make_work() -> Work:
     """Return room for one pair."""
     return Work(
@@ -51,7 +51,7 @@ def make_work() -> Work:
     )
 
 
-@jit
+@inner
 def _edges(c: np.ndarray, out: np.ndarray) -> None:
     """Write the Bernstein coefficients of the edges of corners `c` (2, 3, 4) to `out` (3, 3)."""
     for edge in range(3):
@@ -64,7 +64,7 @@ def _edges(c: np.ndarray, out: np.ndarray) -> None:
         out[2, edge] = turn * (px * qy - py * qx)
 
 
-@jit
+@inner
 def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     """Write the local times at which an edge may change sign to `root[:, edge]`; 1 where there is none."""
     i, j = FIRST[edge], SECOND[edge]
@@ -91,13 +91,13 @@ def _edge_roots(corner: np.ndarray, edge: int, root: np.ndarray) -> None:
     root[0, edge], root[1, edge] = min(first, second), max(first, second)
 
 
-@jit
+@inner
 def _untied(e: float, slope_x: float, slope_y: float) -> float:
     """Return `e`, or where it is 0 the first of its slopes along the ray's x and y that is not."""
     return e if e != 0 else slope_x if slope_x != 0 else slope_y
 
 
-@jit
+@inner
 def _edge_signs(work: Work, edge: int) -> None:
     """Write the signs of an edge that may change it before, between and after its roots."""
     corner = work.corner
@@ -123,7 +123,7 @@ def _edge_signs(work: Work, edge: int) -> None:
         start = end
 
 
-@jit
+@inner
 def _still_sign(work: Work) -> int:
     """Return the common sign of the edges of corners at rest, 0 if there is none."""
     e, corner = work.edge, work.corner
@@ -143,7 +143,7 @@ def _still_sign(work: Work) -> int:
     return common
 
 
-@jit
+@inner
 def _inside_sign(work: Work, u: float) -> int:
     """Return the common sign of the edges at a local time, 0 outside."""
     common = 0
@@ -155,14 +155,14 @@ def _inside_sign(work: Work, u: float) -> int:
     return common
 
 
-@jit
+@inner
 def _plane_at(corner: np.ndarray, c: int, end: int, is_near: bool) -> float:
     """Return the value of a clip plane at a corner."""
     z, w = corner[end, c, 3], corner[end, c, 2]
     return z + w if is_near else w - z
 
 
-@jit
+@inner
 def _plane_roots(work: Work, is_near: bool, n_cuts: int) -> int:
     """Append the local times at which the hit may cross a clip plane to the cuts, and return their number."""
     e, cubic = work.edge, work.room
@@ -183,7 +183,7 @@ def _plane_roots(work: Work, is_near: bool, n_cuts: int) -> int:
     return n_cuts
 
 
-@jit
+@inner
 def _plane_mean(work: Work, is_near: bool, start: float, end: float) -> float:
     """Return the mean of a clip plane's value at the hit over a piece of local time."""
     corner, mean = work.corner, 0.0
@@ -200,7 +200,7 @@ def _plane_mean(work: Work, is_near: bool, start: float, end: float) -> float:
     return mean
 
 
-@jit
+@inner
 def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> int:
     """Return how many pieces of its time a prism covers a ray, and write them to `work.piece`.
 
@@ -282,7 +282,7 @@ def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> i
     return count
 
 
-@jit
+@inner
 def nearness_of(work: Work, start: float, end: float, orders_by_w: bool, out: tuple[np.ndarray, int, int]) -> None:
     """Write the eight Bernstein coefficients of M and D over a piece of local time to `out`: an array, row and column.
 

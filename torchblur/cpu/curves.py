@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import DIRECTIONAL, SPOT, Lit, along
 from torchblur.cpu.layers import Looks
 from torchblur.prisms import Prisms
@@ -76,7 +76,7 @@ def find_stock(prisms: Prisms) -> Stock:
     return stock
 
 
-@jit
+@inner
 def make_span(n_layers: int, n_lamps: int) -> Span:
     """Return room for so many layers under so many lamps."""
     n, ints = n_layers, np.int64

@@ -15,7 +15,7 @@ import numpy as np
 from torchblur.cpu import batch as batches
 from torchblur.cpu.batch import Batch, W, X, Y, Z
 from torchblur.cpu.coverage import Work, find_pieces, nearness_of
-from torchblur.cpu.jit import borrowed, jit
+from torchblur.cpu.jit import borrowed, inner
 from torchblur.cpu.sweep import DEN, HIGH, LOW, N_NUMBERS, NUM, T_END, T_START
 from torchblur.cpu.tiles import TILE_PX, Geometry, Tile, View, clear, close, cover_of, least_of, with_room
 from torchblur.hidden import CLEARLY
@@ -31,7 +31,7 @@ PAIRS = np.array(list(itertools.combinations(range(6), 2)))
 _U = np.uint64  # see batch.py
 
 
-@jit
+@inner
 def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_px: float) -> tuple[int, int]:
     """Return the first and last column between `ends` inside the hull of the corners of a prism; see pairs.py."""
     low, high = ends
@@ -51,7 +51,7 @@ def _columns(c: np.ndarray, which: int, level: float, ends: tuple[int, int], x_p
     return int(min(max(first, low), high + 1)), int(max(min(last, high), low - 1))
 
 
-@jit
+@inner
 def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int, float, float], work: Work) -> None:
     """Find the intervals in which a prism covers a ray, `who`: prism, pixel of the tile, x and y in NDC."""
     k, pixel, x_ndc, y_ndc = who
@@ -81,7 +81,7 @@ def _solve_hard(geometry: Geometry, view: View, tile: Tile, who: tuple[int, int,
     _keep(geometry, view, tile, n_pieces)
 
 
-@jit
+@inner
 def _keep(geometry: Geometry, view: View, tile: Tile, n: int) -> None:
     """Take over `n` intervals that follow those of the tile, with local times and `next` their pixel: in shutter time,
     linked, and without those that are hidden.
@@ -115,7 +115,7 @@ def _keep(geometry: Geometry, view: View, tile: Tile, n: int) -> None:
     tile.counts[0] = place
 
 
-@jit
+@inner
 def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, work: Work) -> Tile:
     """Find the intervals of the `n` pairs of a batch."""
     field, near, who, covered = batch.field, batch.near, batch.who, batch.covered
@@ -151,13 +151,13 @@ def _flush(geometry: Geometry, view: View, tile: Tile, batch: Batch, n: int, wor
     return tile
 
 
-@jit
+@inner
 def _ray_of(view: View, column: int, row: int) -> tuple[float, float]:
     """Return x and y of a pixel's ray in NDC."""
     return 2 * (column + view.x_px) / view.width - 1, 1 - 2 * (row + view.y_px) / view.height
 
 
-@jit
+@inner
 def fill_tile(
     geometry: Geometry, view: View, tile: Tile, which: tuple[np.ndarray, int, int], room: tuple[Batch, Work]
 ) -> Tile:

@@ -37,9 +37,14 @@ def jit(function: Callable[..., Any]) -> Callable[..., Any]:
     return _compiled(function)
 
 
+def inner(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return `function` for compiled code alone: what lets the interpreter call it takes long to compile. Ours."""
+    return _compiled(function, no_cpython_wrapper=True, no_cfunc_wrapper=True)
+
+
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return `function` for others to be compiled into: a call hands over some eight numbers for each array. Ours."""
-    return _compiled(function, forceinline=True)
+    return _compiled(function, forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 @intrinsic

@@ -15,7 +15,7 @@ import numpy as np
 
 from torchblur.certificate import GROWTH, LEVELS, ROUNDING, SCALE_LIMIT, TOLERANCE, VECTOR_LIMIT
 from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, NEAR, TEXTURED, VARYING, Span
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import SPOT, Lit
 from torchblur.cpu.layers import Looks
 from torchblur.light_bends import LINEAR
@@ -42,7 +42,7 @@ class Panel(NamedTuple):
     axis: np.ndarray  # (lamps, 2, 3)
 
 
-@jit
+@inner
 def make_panel(n_layers: int, n_lamps: int) -> Panel:
     """Return room for so many layers under so many lamps."""
     n = n_layers

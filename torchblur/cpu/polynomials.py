@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 
 MAX_DEGREE = 8  # 6 of a difference of two nearnesses, 8 of mip levels and cones
 NARROW = 2.0**-51  # relative: step or bracket that ends the search for a root
@@ -41,7 +41,7 @@ def restrict_cubic(
     return v * b0 + u * b1, s * b0 + t * b1, s * d0 + t * d1, s * e0 + t * e1
 
 
-@jit
+@inner
 def sort_by(key: np.ndarray, column: int, order: np.ndarray, n: int) -> None:
     """Put `n` rows of `key` that `order` holds in ascending order of a column. Source: Shell 1959."""
     gap = 1
@@ -74,7 +74,7 @@ def signs_of(c: np.ndarray, row: int, n: int, noise: float) -> tuple[int, int, i
     return changes, first, last
 
 
-@jit
+@inner
 def _only_root(c: np.ndarray, row: int, n: int, first: int) -> float:
     """Return the place in [0, 1] at which the polynomial of `n` coefficients in a row of `c` changes sign, which it
     does once, from `first`. Worked in the last row of `c`.
@@ -117,7 +117,7 @@ def _only_root(c: np.ndarray, row: int, n: int, first: int) -> float:
     return 1.0 / (1.0 + s) if is_late else s / (1.0 + s)
 
 
-@jit
+@inner
 def roots_of(room: np.ndarray, n: int, noise: float, found: np.ndarray) -> int:
     """Write the places in (0, 1) at which a polynomial changes sign to `found`, and return how many there are.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cells import CROSSING_NOISE
-from torchblur.cpu.jit import inlined, jit
+from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.polynomials import MAX_DEGREE, cubic_at, restrict_cubic, roots_of, sort_by
 from torchblur.sort import TIE
 
@@ -55,7 +55,7 @@ class Solver(NamedTuple):
     found: np.ndarray  # (MAX_DEGREE,)
 
 
-@jit
+@inner
 def make_ray(n: int) -> Ray:
     """Return room for `n` intervals."""
     ints = np.int64
@@ -69,13 +69,13 @@ def make_ray(n: int) -> Ray:
     )
 
 
-@jit
+@inner
 def make_cells(n_cells: int, n_layers: int) -> Cells:
     """Return room for so many cells and layers."""
     return Cells(np.empty((n_cells, 2)), np.zeros(n_cells + 1, np.int64), np.empty(n_layers, np.int64))
 
 
-@jit
+@inner
 def make_solver() -> Solver:
     """Return room to look for crossings."""
     return Solver(np.empty((MAX_HALVINGS + 4, MAX_DEGREE + 3)), np.empty(MAX_DEGREE))
@@ -96,7 +96,7 @@ def _nearness(data: np.ndarray, pace: np.ndarray, i: int, t: float) -> tuple[flo
     return (num, den) if den >= 0 else (-num, -den)
 
 
-@jit
+@inner
 def _is_in_front(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
     """Return whether interval `i` is in front of `j` in the middle of a cell, by a close look."""
     data, mark, pace = ray.data, ray.mark, ray.pace
@@ -229,7 +229,7 @@ def _certify(ray: Ray, n: int, opaque: int, cell: tuple[float, float, float], so
     return until if until - end <= least else end
 
 
-@jit
+@inner
 def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> tuple[int, int]:
     """Write the cells of a ray to `cells`, and return their number and that of crossings; NO_ROOM where they are more.
 

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu.jit import jit
+from torchblur.cpu.jit import inner
 from torchblur.cpu.polynomials import sort_by
 from torchblur.cpu.sweep import HIGH, IS_OPAQUE, N_NUMBERS, PRISM, RANK, T_END, T_START, Ray
 from torchblur.hidden import CLEARLY
@@ -66,7 +66,7 @@ class Tile(NamedTuple):
     counts: np.ndarray  # (3,) int64 intervals now; pairs solved and left out in all
 
 
-@jit
+@inner
 def make_tile() -> Tile:
     """Return room for a tile."""
     n, room = TILE_PX * TILE_PX, 8 * TILE_PX * TILE_PX
@@ -83,7 +83,7 @@ def make_tile() -> Tile:
     )
 
 
-@jit
+@inner
 def close(
     cover: np.ndarray, run: np.ndarray, pixel: int, interval: tuple[float, float, float], window: tuple[float, float]
 ) -> bool:
@@ -110,7 +110,7 @@ def close(
     return is_closer
 
 
-@jit
+@inner
 def _slices(times: tuple[float, float], window: tuple[float, float]) -> tuple[int, int]:
     """Return the first and the last slice that a time reaches."""
     scale = SLICES / (window[1] - window[0])
@@ -118,7 +118,7 @@ def _slices(times: tuple[float, float], window: tuple[float, float]) -> tuple[in
     return min(max(first, 0), SLICES - 1), min(max(last, 0), SLICES - 1)
 
 
-@jit
+@inner
 def cover_of(cover: np.ndarray, pixel: int, times: tuple[float, float], window: tuple[float, float]) -> float:
     """Return the nearness at which a ray is closed all through some time."""
     first, last = _slices(times, window)
@@ -128,7 +128,7 @@ def cover_of(cover: np.ndarray, pixel: int, times: tuple[float, float], window: 
     return least
 
 
-@jit
+@inner
 def with_room(tile: Tile, n: int) -> Tile:
     """Return the tile with room for `n` intervals more."""
     have = tile.counts[0]
@@ -140,7 +140,7 @@ def with_room(tile: Tile, n: int) -> Tile:
     return Tile(tile.place, data, prism, following, tile.last, tile.cover, tile.least, tile.run, tile.counts)
 
 
-@jit
+@inner
 def clear(tile: Tile) -> None:
     """Forget what covers the tile."""
     last, least, cover, run = tile.last, tile.least, tile.cover, tile.run
@@ -151,7 +151,7 @@ def clear(tile: Tile) -> None:
             cover[pixel, k], run[pixel, k, 0], run[pixel, k, 1] = 0.0, np.inf, -np.inf
 
 
-@jit
+@inner
 def least_of(cover: np.ndarray, pixel: int) -> float:
     """Return the nearness at which a ray is closed all the time."""
     least = cover[pixel, 0]
@@ -160,7 +160,7 @@ def least_of(cover: np.ndarray, pixel: int) -> float:
     return least
 
 
-@jit
+@inner
 def count_ray(tile: Tile, pixel: int) -> int:
     """Return how many intervals of a ray were found."""
     following = tile.next
@@ -171,7 +171,7 @@ def count_ray(tile: Tile, pixel: int) -> int:
     return n
 
 
-@jit
+@inner
 def gather_ray(geometry: Geometry, tile: Tile, pixel: int, window: tuple[float, float], ray: Ray) -> int:
     """Write the intervals of a ray that are not hidden to `ray` in order of their starts, and return their number."""
     following, found, cover, active = tile.next, tile.data, tile.cover, ray.active

@@ -16,7 +16,8 @@ def compile_ahead() -> None:
     corners = torch.tensor([[-0.5, -0.5, 0.0], [0.5, -0.5, 0.0], [0.0, 0.5, 0.1]])
     faces, uv = torch.tensor([[0, 1, 2]]), torch.tensor([[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]]])
     motion = torch.stack([corners, corners + 0.1])
-    for look in (tb.Material(), tb.Material(texture=torch.ones(2, 2, 3), shading="lambert")):
+    image = torch.ones(2, 2, 3)
+    for look in (tb.Material(), tb.Material(texture=image), tb.Material(texture=image, shading="lambert")):
         mesh = tb.Mesh(motion, faces, look, uv=uv)
         scene = tb.Scene([mesh], tb.Camera(torch.eye(4), 4, 4), lights=[tb.DirectionalLight((0.0, 0.0, -1.0), 1.0)])
         tb.render(scene, backend="auto")

@@ -73,6 +73,16 @@ def test_textures_lights_and_shadows(name, casts_shadows):
     compare(lit_scenes.to_torch(lit_scenes.SCENES[name](), casts_shadows=casts_shadows))
 
 
+@pytest.mark.parametrize("name", lit_scenes.SCENES)
+def test_textures_and_lights_are_compiled(name):
+    """Torch cuts no cells and places no samples."""
+    scene = lit_scenes.to_torch(lit_scenes.SCENES[name](), torch.float32)
+    frame = tb.render(scene)
+    assert frame.counts["nodes"] > 0
+    assert frame.timings["resolve"] > 0
+    assert frame.timings["cells"] == frame.timings["nodes"] == 0
+
+
 @pytest.mark.parametrize("name", ["crossing", "four segments", "moving camera"])
 def test_windows(name):
     scene, windows = make.to_torch(agreement_scenes.SCENES[name]()), [(0.0, 0.3), (0.2, 0.9), (0.5, 0.50001)]

@@ -42,7 +42,7 @@ class Frame:
     counts: dict[str, int]  # how many of ledger.COUNTS
     timings: dict[str, float]  # seconds in each of ledger.STAGES
     effect_timings: dict[str, float]  # seconds of them in code that serves one of ledger.TIMED_EFFECTS alone; the
-    # others share theirs, and the compiled path does not tell crossings from the rest
+    # others share theirs, and the compiled path tells only what prepares textures and finds shadows from the rest
     plan: EffectPlan  # which effects were simulated, and why
 
 

@@ -125,6 +125,7 @@ def integrate(
 
     Source: ours.
     """
+    announce(expose.expose)
     surfaces, camera = sight.prisms.surfaces, scene.camera
     image = np.zeros((camera.height, camera.width, len(sight.colours.delay), blend.N_LOOKS + len(scene.meshes)))
     times = sorted({t for light in surfaces.lights for t in light.knots})

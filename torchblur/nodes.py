@@ -64,6 +64,10 @@ class Varying:
     which_lit: Tensor
     shadows: Shadows | None = None  # of the lit paths, once they have been found
 
+    def pixel_of_receivers(self, cells: Cells) -> Tensor:
+        """Return the pixel of the cell that each of the lit paths is in, in ascending order."""
+        return packed.owners(cells.offsets)[self.cell[self.lit.paths.span]]
+
     def lit_paths_of(self, cells: Cells, is_varying: Tensor, layer: Tensor, span: Tensor) -> Tensor:
         """Return which of the lit paths layers are on over spans, -1 for none.
 

@@ -41,6 +41,11 @@ class Ranges:
     end: Tensor  # (R,)
     caster: Tensor  # (R,) int64; NOTHING where opaque
 
+    def choose(self, chosen: Tensor) -> Ranges:
+        """Return the ranges of the receivers `chosen` (J,)."""
+        index, offsets = packed.select(self.offsets, chosen)
+        return Ranges(offsets, self.start[index], self.end[index], self.caster[index])
+
 
 @dataclass(frozen=True)
 class Shadows:
@@ -48,6 +53,10 @@ class Shadows:
 
     ranges: tuple[Ranges | None, ...]  # light by light; None for one that casts no shadows
     n_pairs: int  # of receivers and casters that were looked at
+
+    def choose(self, chosen: Tensor) -> Shadows:
+        """Return what the receivers `chosen` (J,) get; of the pairs, all that were looked at."""
+        return Shadows(tuple(r.choose(chosen) if r else None for r in self.ranges), self.n_pairs)
 
     @property
     def n_ranges(self) -> int:

@@ -19,8 +19,8 @@ from torch import Tensor
 from torchblur import bernstein, packed
 from torchblur.blocking import Receivers
 from torchblur.casters import Casters
-from torchblur.cpu.join import join
-from torchblur.cpu.sieve import arrays_of
+from torchblur.cpu.join import Found, join
+from torchblur.cpu.sides import arrays_of
 from torchblur.lights import DirectionalLight, Light, along, unit
 from torchblur.prisms import swept_bounds_px
 
@@ -62,21 +62,32 @@ def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Ite
         yield together(kept)
 
 
-def sifted_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[tuple[Tensor, Tensor], int]]:
-    """Yield those of `candidate_pairs`, in its order, that may block the light by a closer look, and how many it has:
-    compiled, for tensors on the CPU. Source: ours.
+def blocked_ranges(
+    light: Light, receivers: Receivers, casters: Casters, hides: Tensor
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], int]:
+    """Return receiver, caster, start and end (R,) of the shares of the receivers' slices in which `candidate_pairs`
+    block the light, and how many pairs were looked at: compiled, for tensors on the CPU.
+
+    Args:
+        light: that shines.
+        receivers: K points.
+        casters: C triangles.
+        hides: (C,) bool, which of them are opaque: what these block, others need not be looked at for.
+
+    Source: ours.
     """
     views = _directional_views if isinstance(light, DirectionalLight) else _cube_views
-    faces = receivers.face.contiguous().numpy(), casters.face.contiguous().numpy()
+    faces = receivers.face.contiguous().numpy(), casters.face.contiguous().numpy(), hides.contiguous().numpy()
     arrays = faces, arrays_of(light, receivers, casters)
+    found, n_seen = Found.nothing(receivers.count, casters.count), 0
     for view in views(light, receivers, casters):
         things = _in_common_box(*view)
         n, m = (len(thing.which) for thing in things)
         if n * m:
             boxes = ((t.which, torch.cat([t.low, t.high, t.depth.unsqueeze(0)]), _level(t)) for t in things)
-            (r, c), n_seen = join(*boxes, n * m <= FEW_PAIRS, arrays)
-            for start in range(0, max(len(r), 1), AT_ONCE):
-                yield (r[start : start + AT_ONCE], c[start : start + AT_ONCE]), 0 if start else n_seen
+            found, more = join(*boxes, n * m <= FEW_PAIRS, arrays, found)
+            n_seen += more
+    return found.rows(), n_seen
 
 
 def together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:

@@ -16,7 +16,6 @@ from torchblur.casters import Casters
 from torchblur.cpu.jit import inlined, jit
 from torchblur.lights import DirectionalLight, Light
 
-ROOM = 16.0  # times the rounding that counts as 0: what that leaves out in any order of sums is left out, nothing else
 FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
 FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
 
@@ -265,12 +264,12 @@ def _along_direction(corner, way, point, scratch, out):
 
 @inlined
 def is_excluded(signs, noise, n_signs):
-    """Return whether the first coefficients `signs` (5, 6) show that no time has one sign, to `noise` (5,)."""
+    """Return whether the first coefficients `signs` (5, 6), of edges, show that no time has one sign, to `noise` (5,)."""
     can_be_up, can_be_down = True, True
     for q in range(n_signs):
         low, high = signs[q, 0], signs[q, 0]
         for k in range(1, 6):
             low, high = min(low, signs[q, k]), max(high, signs[q, k])
-        can_be_up &= high >= -ROOM * noise[q]
-        can_be_down &= low <= ROOM * noise[q]
+        can_be_up &= high >= -noise[q]
+        can_be_down &= low <= noise[q]
     return not (can_be_up or can_be_down)

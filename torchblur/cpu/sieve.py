@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from torchblur.blocking import HALVINGS
 from torchblur.cpu.jit import jit
-from torchblur.cpu.sides import ROOM
+
+N_EDGES = 3  # of the signs: an edge that is 0 may count as either sign
 
 
 @jit
 def may_be_alike(signs, noise, n_signs):
     """Return whether coefficients `signs` (halvings + 1, 5, 6), of which the first are given, may have one sign at some
-    time, to ROOM times `noise` (5,).
+    time, to `noise` (5,).
     """
     halves, depth = 0, 0  # bit l: the second half of level l is looked at
     while True:
@@ -26,10 +27,11 @@ def may_be_alike(signs, noise, n_signs):
             low, high = signs[depth, q, 0], signs[depth, q, 0]
             for k in range(1, 6):
                 low, high = min(low, signs[depth, q, k]), max(high, signs[depth, q, k])
-            can_be_up &= high >= -ROOM * noise[q]
-            can_be_down &= low <= ROOM * noise[q]
-            surely_up &= low > ROOM * noise[q]
-            surely_down &= high < -ROOM * noise[q]
+            least = -noise[q] if q < N_EDGES else noise[q]
+            can_be_up &= high >= least
+            can_be_down &= low <= -least
+            surely_up &= low > noise[q]
+            surely_down &= high < -noise[q]
         if surely_up or surely_down:
             return True
         if can_be_up or can_be_down:

@@ -19,9 +19,10 @@ from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.sides import shared_time
 from torchblur.sort import SAME_TIME
 
-Things = tuple[Tensor, Tensor, Tensor]
+Things = tuple[Tensor, Tensor, Tensor, Tensor]
 STARTING_ROOM = 1 << 12  # pieces
 APART = -1
+ROUNDING = 1e-9  # of a part of a caster's time
 
 
 class Found(NamedTuple):
@@ -51,8 +52,9 @@ def join(receiver: Things, caster: Things, sees_all: bool, arrays: tuple, found:
     """Return what is known after a view, and how many pairs were looked at in it.
 
     Args:
-        receiver: which (n,), box (5, n) of least x and y, greatest x and y in [0, 1], and depth, and level (n,).
-        caster: likewise.
+        receiver: which (n,), box (5, n) of least x and y, greatest x and y in [0, 1], and depth, level (n,), and
+            nothing more.
+        caster: likewise, and (parts, 4, n) least and greatest x and y in equal parts of its time.
         sees_all: whether to look at all pairs rather than at those that touch a common cell.
         arrays: faces of the receivers (K,) and of the casters (C,), whether each caster (C,) hides all behind it, and
             what `sides.arrays_of` returns.
@@ -60,7 +62,10 @@ def join(receiver: Things, caster: Things, sees_all: bool, arrays: tuple, found:
 
     Source: ours.
     """
-    a, b = ((w.numpy(), box.T.contiguous().numpy(), level.numpy()) for w, box, level in (receiver, caster))
+    a, b = (
+        (w.numpy(), box.T.contiguous().numpy(), level.numpy(), parts.permute(2, 0, 1).contiguous().numpy())
+        for w, box, level, parts in (receiver, caster)
+    )
     look = _join_all if sees_all else _join_levels
     keys, times, count, n = look(a, b, arrays, found, work_room())
     for was_seen, things in zip(found.was_seen, (a, b), strict=True):
@@ -156,7 +161,7 @@ def _look(things, places, more, out):
         _, _, low, high = shared_time(pair, arrays[1])
         if known[pair[0], 0] <= low and high <= known[pair[0], 1]:
             return APART
-    return _solve(pair, more, out)
+    return _solve(pair, more, out) if _meet_in_part(a, b, places, arrays) else 0
 
 
 @jit
@@ -202,6 +207,28 @@ def _meet(a, b, places, arrays):
     if thing[0].shape[1] == 1:
         return first >= start and (first < end or end == 1)
     return max(first, start) < min(last, end)
+
+
+@inlined
+def _meet_in_part(a, b, places, arrays):
+    """Return whether the rectangle of a receiver overlaps that of a caster in a part of the time that they share."""
+    i, j = places
+    p, parts = a[1], b[3]
+    times, slices = arrays[1][0][2], arrays[1][1][1]
+    start, end = slices[b[0][j], 0], slices[b[0][j], 1]
+    n = parts.shape[1]
+    rate = n / (end - start)
+    first = max(int((times[a[0][i], 0] - start) * rate - ROUNDING), 0)
+    last = min(int((times[a[0][i], 1] - start) * rate + ROUNDING), n - 1)
+    for k in range(first, last + 1):
+        if (
+            p[i, 0] <= parts[j, k, 2]
+            and parts[j, k, 0] <= p[i, 2]
+            and p[i, 1] <= parts[j, k, 3]
+            and parts[j, k, 1] <= p[i, 3]
+        ):
+            return True
+    return False
 
 
 @jit

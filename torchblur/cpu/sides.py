@@ -158,13 +158,20 @@ def _dot_2_1(a, b0, b1, out):
         out[i + 1] += last * (i + 1) / 3
 
 
-@jit
-def _largest(values):
-    """Return the greatest absolute value of an array of any shape."""
+@inlined
+def _largest(rows):
+    """Return the greatest absolute value of rows (n, 3)."""
     out = 0.0
-    for v in values.flat:
-        out = max(out, abs(v))
+    for i in range(len(rows)):
+        for d in range(3):
+            out = max(out, abs(rows[i, d]))
     return out
+
+
+@inlined
+def _largest_corner(corner):
+    """Return the greatest absolute value of corners (2, 3, 3)."""
+    return max(_largest(corner[0]), _largest(corner[1]))
 
 
 @jit
@@ -173,18 +180,13 @@ def _from_position(corner, lamp, point, scratch, out):
     p, s, gap = point
     normals, vector, _, rest, _ = scratch
     signs, noise = out
-    scale, away = (s[0] + s[1] + s[2]) / 3, 0.0
-    for d in range(3):
-        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
-    away = gap * max(_largest(corner), away / scale)
+    size = _largest_corner(corner)
     reach = _largest(p) + max(s[0], s[1], s[2]) * _largest(lamp)
-    square = 0.0
     for d in range(3):
         vector[0, d] = p[0, d] - s[0] * lamp[0, d]
         vector[1, d] = p[1, d] - (s[0] * lamp[1, d] + 2 * s[1] * lamp[0, d]) / 3
         vector[2, d] = p[2, d] - (2 * s[1] * lamp[1, d] + s[2] * lamp[0, d]) / 3
         vector[3, d] = p[3, d] - s[2] * lamp[1, d]
-        square += ((vector[0, d] + vector[1, d] + vector[2, d] + vector[3, d]) / 4) ** 2
         for i in range(3):
             corner[0, i, d] -= lamp[0, d]
             corner[1, i, d] -= lamp[1, d]
@@ -201,6 +203,11 @@ def _from_position(corner, lamp, point, scratch, out):
         noise[e] = NOISE * reach * sizes[e]
         if e > 0 and is_excluded(signs, noise, e + 1):
             return 0
+    scale, away, square = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0
+    for d in range(3):
+        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
+        square += ((vector[0, d] + vector[1, d] + vector[2, d] + vector[3, d]) / 4) ** 2
+    away = gap * max(size, away / scale)
     distance = np.sqrt(square) / scale
     bias = min(away / distance, 1.0) if distance > 0 else 1.0
     for k in range(6):
@@ -226,7 +233,7 @@ def _along_direction(corner, way, point, scratch, out):
     for d in range(3):
         away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
         square += (0.5 * (way[0, d] + way[1, d])) ** 2
-    away = gap * max(_largest(corner), away / scale)
+    away = gap * max(_largest_corner(corner), away / scale)
     reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
     size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
     signs[:] = 0.0
@@ -264,7 +271,7 @@ def _along_direction(corner, way, point, scratch, out):
 
 @inlined
 def is_excluded(signs, noise, n_signs):
-    """Return whether the first coefficients `signs` (5, 6), of edges, show that no time has one sign, to `noise` (5,)."""
+    """Return whether the first coefficients `signs` (5, 6), of edges, show that no time has one sign."""
     can_be_up, can_be_down = True, True
     for q in range(n_signs):
         low, high = signs[q, 0], signs[q, 0]

@@ -43,7 +43,13 @@ def random_receivers(generator: np.random.Generator, n: int, instants: bool) -> 
         place, scale = generator.normal(size=(4, 3, n)), generator.uniform(0.5, 2.0, (3, n))
         place[:, :, : n // 2] = place[:1, :, : n // 2] + 0.05 * place[:, :, : n // 2]  # nearly still ones
         scale[:, : n // 2] = 1.0
-    return Receivers(tensor(place), tensor(scale), tensor(t), torch.full((n,), -1))
+    rests = torch.arange(n) % 3 == 0
+    return Receivers(*at_rest(rests, tensor(place), tensor(scale)), tensor(t), torch.full((n,), -1), rests)
+
+
+def at_rest(rests: torch.Tensor, place: torch.Tensor, scale: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return places and scales of which those that rest do."""
+    return torch.where(rests, place[:1], place), torch.where(rests, scale[:1], scale)
 
 
 def random_lit(generator: np.random.Generator, k: int, kind: str, n_faces: int, instants: bool):
@@ -82,6 +88,12 @@ def compiled(light, receivers: Receivers, casters) -> tuple[np.ndarray, int]:
     return merged(*found), n
 
 
+def assert_same_times(found: np.ndarray, expected: np.ndarray) -> None:
+    """Compare ends of pieces; where polynomials all but touch 0 their roots magnify the rounding of another sum."""
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-11)
+    assert (np.abs(found - expected) > 1e-13).mean() < 0.01
+
+
 @pytest.mark.parametrize("instants", [False, True])
 @pytest.mark.parametrize("kind", list(LAMPS))
 def test_no_pair_that_blocks_is_left_out(kind, instants):
@@ -93,7 +105,7 @@ def test_no_pair_that_blocks_is_left_out(kind, instants):
         pairs = every_pair(receivers, casters)
         every, (found, n) = plainly(light, receivers, casters, pairs), compiled(light, receivers, casters)
         np.testing.assert_array_equal(found[:, :2], every[:, :2])
-        np.testing.assert_allclose(found[:, 2:], every[:, 2:], rtol=0, atol=1e-12)
+        assert_same_times(found[:, 2:], every[:, 2:])
         n_all, n_seen, n_blocked = n_all + len(pairs[0]), n_seen + n, n_blocked + len(found)
     assert n_blocked > 50
     assert n_seen < 0.75 * n_all
@@ -110,7 +122,7 @@ def test_a_hundred_scenes_have_the_pairs_and_times_of_the_plain_path(few, monkey
         plain, (found, n) = plainly(light, receivers, casters, pairs), compiled(light, receivers, casters)
         assert n == len(pairs[0])
         np.testing.assert_array_equal(found[:, :2], plain[:, :2])
-        np.testing.assert_allclose(found[:, 2:], plain[:, 2:], rtol=0, atol=1e-12)
+        assert_same_times(found[:, 2:], plain[:, 2:])
         n_blocked += len(plain)
     assert n_blocked > 1000
 

@@ -320,7 +320,8 @@ def follow_plan(plan: EffectPlan, prisms: Prisms, survey: Survey, accuracy: Accu
     surfaces = prisms.surfaces
     never = torch.zeros_like(survey.is_still)
     if "curvature" in forced:
-        prisms = replace(prisms, surfaces=replace(surfaces, is_varying=torch.ones_like(surfaces.is_varying)))
+        always = torch.ones_like(surfaces.is_varying)
+        prisms = replace(prisms, surfaces=replace(surfaces, is_varying=always, rests=~always))
     if "clipping" in forced:
         prisms = replace(prisms, is_clipped=~never)
     cuts_matter = accuracy.method != "exact" and bool((surfaces.is_textured | surfaces.is_lit).any())

@@ -177,7 +177,8 @@ class Exposure:
         portions = self._portions(cells, varying)
         if len(portions) <= 1:
             return self._resolve_cells(intervals, cells, pixel, varying)
-        receiver_pixel, parts = varying.pixel_of_receivers(cells), []
+        receiver_pixel = packed.owners(cells.offsets)[varying.cell[varying.span_of_receivers]]
+        parts = []
         for chosen in portions:
             *own, of = *cells.of_pixels(intervals, chosen), tuple(place[chosen] for place in pixel)
             some = self._varying(*own, of)

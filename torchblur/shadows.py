@@ -180,8 +180,9 @@ def visible_at(surfaces: Surfaces, point: Tensor, t: Tensor, face: Tensor) -> Te
     if surfaces.casters is None:
         return None
     now = t.detach()
-    receivers = Receivers(point.detach().unsqueeze(0), torch.ones_like(now).unsqueeze(0), torch.stack([now, now]), face)
     every = torch.ones_like(face, dtype=torch.bool)
+    place, scale = point.detach().unsqueeze(0), torch.ones_like(now).unsqueeze(0)
+    receivers = Receivers(place, scale, torch.stack([now, now]), face, every)
     shadows = find_shadows(surfaces, receivers, (every,) * len(surfaces.lights))
     return shadows.visibility(surfaces, torch.arange(len(t), device=t.device), torch.zeros_like(now), (point, t))
 

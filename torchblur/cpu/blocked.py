@@ -1,6 +1,6 @@
 """When a caster blocks a light for a receiver, compiled: the exact times of a pair.
 
-Before: sides.py, polynomials.py, shadow_rays.py.  After: join.py.
+Before: still_sides.py, polynomials.py, shadow_rays.py.  After: join.py.
 Symbols: as in blocking.py, whose rules these are: of signs, of what is rounding, and of edges that are hit.
 Source: as blocking.py.
 """
@@ -13,8 +13,9 @@ from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.jit import inlined, jit
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
 from torchblur.cpu.shadow_rays import blocks_place, blocks_way
-from torchblur.cpu.sides import along, polynomials, scratch_room, shared_time
+from torchblur.cpu.sides import along, polynomials, scratch_room
 from torchblur.cpu.sieve import may_be_alike
+from torchblur.cpu.still_sides import still_polynomials
 from torchblur.sort import SAME_TIME
 
 MOST_TIMES = 5 * MAX_DEGREE + 2  # at which one of the signs may change, and both ends
@@ -27,27 +28,33 @@ def work_room():
     return np.empty((MOST_PIECES, 2)), scratch_room(), solver
 
 
-@jit
-def find_blocked(pair, arrays, room):
+@inlined
+def find_blocked(pair, shared, arrays, room):
     """Write when a caster blocks the light, as shares (start, end) of the receiver's slice, to the first of `room`, and
     return how many pieces these are. An instant is blocked from 0 to 1.
+
+    Args:
+        pair: receiver and caster.
+        shared: when the part of the time that they share begins and ends which is looked at, and both as shares of the
+            receiver's slice.
+        arrays: of `sides.arrays_of`.
+        room: of `work_room`.
     """
     r, c = pair
     pieces, scratch, solver = room
-    (place, _, times, rests), caster, (_, _, light_rests) = arrays
-    if place.shape[1] == 1:
-        pieces[0, 0], pieces[0, 1] = 0.0, 1.0
-        return 1 if _is_blocked_at(pair, times[r, 0], arrays, scratch) else 0
-    shared = shared_time(pair, arrays)
+    (place, _, _, rests), caster, (_, _, light_rests) = arrays
     _, _, low, high = shared
-    if light_rests and rests[r] and caster[3][c]:
+    signs, noise = scratch[3]
+    if place.shape[1] > 1 and not (light_rests and rests[r]):
+        degree, n_signs = 5, polynomials(pair, shared, arrays, scratch)
+    elif place.shape[1] > 1 and not caster[3][c]:
+        degree, n_signs = 3, still_polynomials(pair, shared, arrays, scratch)
+    else:
         pieces[0, 0], pieces[0, 1] = low, high
         return 1 if _is_blocked_at(pair, shared[0], arrays, scratch) else 0
-    signs, noise = scratch[3]
-    n_signs = polynomials(pair, shared, arrays, scratch)
-    if n_signs == 0 or not may_be_alike(signs, noise, n_signs):
+    if n_signs == 0 or not may_be_alike(signs, noise, n_signs, degree + 1):
         return 0
-    n = _pieces(signs[0], (noise, n_signs, scratch[4][0]), solver, pieces)
+    n = _pieces(signs[0], (noise, n_signs, degree, scratch[4][0]), solver, pieces)
     for k in range(n):
         pieces[k, 0] = low + pieces[k, 0] * (high - low)
         pieces[k, 1] = high if pieces[k, 1] == 1 else low + pieces[k, 1] * (high - low)
@@ -87,13 +94,13 @@ def _corner(world, i, u):
 @jit
 def _pieces(signs, more, solver, pieces):
     """Write when all signs (5, 6) are alike to `pieces`, in order, those that touch made one; return how many."""
-    noise, n_signs, _ = more
+    noise, n_signs, degree, _ = more
     room, found, times = solver
     times[0], n = 0.0, 1
     for q in range(n_signs):
-        for k in range(6):
+        for k in range(degree + 1):
             room[0, k] = signs[q, k]
-        for k in range(roots_of(room, 6, noise[q], found)):
+        for k in range(roots_of(room, degree + 1, noise[q], found)):
             place = n
             while place > 1 and times[place - 1] > found[k]:
                 times[place] = times[place - 1]
@@ -114,15 +121,17 @@ def _pieces(signs, more, solver, pieces):
     return count
 
 
-@jit
+@inlined
 def _are_alike(signs, more, u):
     """Return whether all signs (5, 6) are alike at a share of the time."""
-    noise, n_signs, normals = more
+    noise, n_signs, degree, normals = more
     side, v = 0.0, 1 - u
     for q in range(n_signs):
-        a, b, c, d, e, f = signs[q, 0], signs[q, 1], signs[q, 2], signs[q, 3], signs[q, 4], signs[q, 5]
-        a, b, c, d, e = v * a + u * b, v * b + u * c, v * c + u * d, v * d + u * e, v * e + u * f
-        a, b, c, d = v * a + u * b, v * b + u * c, v * c + u * d, v * d + u * e
+        a, b, c, d = signs[q, 0], signs[q, 1], signs[q, 2], signs[q, 3]
+        if degree == 5:
+            e, f = signs[q, 4], signs[q, 5]
+            a, b, c, d, e = v * a + u * b, v * b + u * c, v * c + u * d, v * d + u * e, v * e + u * f
+            a, b, c, d = v * a + u * b, v * b + u * c, v * c + u * d, v * d + u * e
         a, b, c = v * a + u * b, v * b + u * c, v * c + u * d
         a, b = v * a + u * b, v * b + u * c
         value = v * a + u * b

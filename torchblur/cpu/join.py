@@ -22,7 +22,9 @@ from torchblur.sort import SAME_TIME
 Things = tuple[Tensor, Tensor, Tensor, Tensor]
 STARTING_ROOM = 1 << 12  # pieces
 APART = -1
+FINER, FINEST = 2, 8  # levels: how much finer cells are than a caster's own, as receivers are small; and of all
 ROUNDING = 1e-9  # of a part of a caster's time
+MOST_OF = 0.5  # of the shared time: what is shorter is looked at alone
 
 
 class Found(NamedTuple):
@@ -99,7 +101,7 @@ def _join_levels(a, b, arrays, found, room):
     more = borrowed((arrays, (found.last, found.known, found.was_seen), room))
     a, b = borrowed(a), borrowed(b)
     finest_a, finest_b = a[2].max(), b[2].max()
-    begin = np.empty(4 ** min(finest_a, finest_b) + 2, dtype=np.int64)
+    begin = np.empty(4 ** min(finest_a, finest_b + FINER, FINEST) + 2, dtype=np.int64)
     for level_a in range(finest_a + 1):
         of_a = np.flatnonzero(a[2] == level_a)
         if len(of_a) == 0:
@@ -108,11 +110,13 @@ def _join_levels(a, b, arrays, found, room):
             of_b = np.flatnonzero(b[2] == level_b)
             if len(of_b) == 0:
                 continue
-            side = 2 ** min(level_a, level_b)
+            side = 2 ** min(level_a, level_b + FINER, FINEST)
             cells_a, cells_b = _cells(a[1], of_a, side), _cells(b[1], of_b, side)
             held = _fill(begin, cells_b, side)
-            for corner in range(4):
-                for i in range(len(of_a)):
+            for i in range(len(of_a)):
+                if _is_dark(a[0][of_a[i]], more):
+                    continue
+                for corner in range(4):
                     x, y = cells_a[i, 0] + corner % 2, cells_a[i, 1] + corner // 2
                     if x > cells_a[i, 2] or y > cells_a[i, 3]:
                         continue
@@ -156,17 +160,17 @@ def _look(things, places, more, out):
     if not _meet(a, b, places, arrays):
         return APART
     pair = a[0][places[0]], b[0][places[1]]
-    known = state[1]
-    if known[pair[0], 1] > known[pair[0], 0]:
-        _, _, low, high = shared_time(pair, arrays[1])
-        if known[pair[0], 0] <= low and high <= known[pair[0], 1]:
-            return APART
-    return _solve(pair, more, out) if _meet_in_part(a, b, places, arrays) else 0
+    parts = _parts_met(a, b, places, arrays[1])
+    if parts[1] < parts[0]:
+        return 0
+    start, end = state[1][pair[0], 0], state[1][pair[0], 1]
+    shared = _narrowed(shared_time(pair, arrays[1]), parts, arrays[1][1][1][pair[1]], b[3].shape[1], (start, end))
+    return _solve(pair, shared, more, out) if shared[0] <= shared[1] else APART
 
 
 @jit
-def _solve(pair, more, out):
-    """Write the pieces of a pair (receiver, caster) as `_look` does, unless it is listed, and return how many."""
+def _solve(pair, shared, more, out):
+    """Write the pieces of a pair (receiver, caster) in a time that both share, as `_look` does, unless it is listed."""
     r, c = pair
     ((_, _, hides), of_pair), (last, known, (receiver_was_seen, caster_was_seen)), room = more
     keys, times, count = out
@@ -176,7 +180,7 @@ def _solve(pair, more, out):
             if keys[row, 1] == c:
                 return 0
             row = keys[row, 2]
-    pieces, n = room[0], find_blocked(pair, of_pair, room)
+    pieces, n = room[0], find_blocked(pair, shared, of_pair, room)
     for k in range(n):
         start, end, row = pieces[k, 0], pieces[k, 1], count + k
         keys[row, 0], keys[row, 1], keys[row, 2] = r, c, last[r]
@@ -210,25 +214,71 @@ def _meet(a, b, places, arrays):
 
 
 @inlined
-def _meet_in_part(a, b, places, arrays):
-    """Return whether the rectangle of a receiver overlaps that of a caster in a part of the time that they share."""
+def _parts_met(a, b, places, arrays):
+    """Return the first and the last part of a caster's time, if any, that a receiver shares and in which its rectangle
+    overlaps the receiver's.
+    """
     i, j = places
-    p, parts = a[1], b[3]
-    times, slices = arrays[1][0][2], arrays[1][1][1]
-    start, end = slices[b[0][j], 0], slices[b[0][j], 1]
-    n = parts.shape[1]
-    rate = n / (end - start)
-    first = max(int((times[a[0][i], 0] - start) * rate - ROUNDING), 0)
-    last = min(int((times[a[0][i], 1] - start) * rate + ROUNDING), n - 1)
+    box, parts = a[1], b[3]
+    times, slices = arrays[0][2], arrays[1][1]
+    r, c, n = a[0][i], b[0][j], parts.shape[1]
+    rate = n / (slices[c, 1] - slices[c, 0])
+    first = max(int((times[r, 0] - slices[c, 0]) * rate - ROUNDING), 0)
+    last = min(int((times[r, 1] - slices[c, 0]) * rate + ROUNDING), n - 1)
+    low, high = n, -1
     for k in range(first, last + 1):
         if (
-            p[i, 0] <= parts[j, k, 2]
-            and parts[j, k, 0] <= p[i, 2]
-            and p[i, 1] <= parts[j, k, 3]
-            and parts[j, k, 1] <= p[i, 3]
+            box[i, 0] <= parts[j, k, 2]
+            and parts[j, k, 0] <= box[i, 2]
+            and box[i, 1] <= parts[j, k, 3]
+            and parts[j, k, 1] <= box[i, 3]
         ):
-            return True
-    return False
+            low, high = min(low, k), k
+    return low, high
+
+
+@inlined
+def _narrowed(shared, parts, times, n, known):
+    """Return of a time that receiver and caster share what lies in the first to last of the `n` parts of the caster's
+    `times`, without parts at the ends that are `known` to be dark; if nothing is left, what begins after it ends.
+    """
+    t_start, t_end, u_start, u_end = shared
+    low, high = parts
+    if t_start == t_end:
+        return shared
+    step, stretch = (times[1] - times[0]) / n, (u_end - u_start) / (t_end - t_start)
+    while (
+        low <= high
+        and known[0] <= _share(low, times, step, shared)
+        and _share(low + 1, times, step, shared) <= known[1]
+    ):
+        low += 1
+    while (
+        low <= high
+        and known[0] <= _share(high, times, step, shared)
+        and _share(high + 1, times, step, shared) <= known[1]
+    ):
+        high -= 1
+    first, last = times[0] + low * step, times[0] + (high + 1) * step
+    if high < low:
+        return 1.0, 0.0, 0.0, 0.0
+    if last - first > MOST_OF * (t_end - t_start):
+        return shared
+    if first > t_start:
+        t_start, u_start = first, u_start + (first - t_start) * stretch
+    if last < t_end:
+        t_end, u_end = last, u_end + (last - t_end) * stretch
+    return t_start, t_end, u_start, u_end
+
+
+@inlined
+def _share(k, times, step, shared):
+    """Return when part `k` of a caster's `times` begins, as a share of the receiver's, in their `shared` time."""
+    t_start, t_end, u_start, u_end = shared
+    t = times[0] + k * step
+    if t <= t_start:
+        return u_start
+    return u_end if t >= t_end else u_start + (t - t_start) * (u_end - u_start) / (t_end - t_start)
 
 
 @jit
@@ -252,10 +302,9 @@ def _fill(begin, cells, side):
     for cell in range(2, side * side + 2):
         begin[cell] += begin[cell - 1]
     held = np.empty(begin[side * side + 1], dtype=np.int64)
-    for corner in range(4):
-        for k in range(len(cells)):
-            x, y = cells[k, 0] + corner % 2, cells[k, 1] + corner // 2
-            if x <= cells[k, 2] and y <= cells[k, 3]:
+    for k in range(len(cells)):
+        for y in range(cells[k, 1], cells[k, 3] + 1):
+            for x in range(cells[k, 0], cells[k, 2] + 1):
                 held[begin[y * side + x + 1]] = k
                 begin[y * side + x + 1] += 1
     return held

@@ -1,6 +1,6 @@
 """The polynomials whose signs tell when a caster blocks a light for a receiver, compiled, a pair at a time.
 
-Before: jit.py, blocking.py.  After: sieve.py, blocked.py.
+Before: jit.py, blocking.py.  After: still_sides.py, blocked.py.
 Symbols: as in blocking.py, whose polynomials these are, all as degree 5.
 Source: as blocking.py.
 """
@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchblur.blocking import HALVINGS, NOISE, Receivers
 from torchblur.casters import Casters
 from torchblur.cpu.jit import inlined, jit
 from torchblur.lights import DirectionalLight, Light
 
+N_COEFFICIENTS = 6
 FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
 FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
 
@@ -36,18 +36,10 @@ def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tup
     stays = (casters.world[0] == casters.world[1]).all(0).all(0)
     of_light = shines.contiguous().numpy(), is_directional, bool((shines == shines[0]).all())
     return (
-        (*thing, _rest(receivers).numpy()),
+        (*thing, receivers.rests.contiguous().numpy()),
         (world.numpy(), slices.numpy(), casters.gap, stays.numpy()),
         of_light,
     )
-
-
-def _rest(receivers: Receivers) -> Tensor:
-    """Return which receivers (K,) stay where they are, but for rounding of their coefficients."""
-    place, scale = receivers.place, receivers.scale
-    slack = NOISE * place[0].abs().amax(0)
-    stays = ((place - place[0]).abs().amax((0, 1)) <= slack) & (scale.amax(0) - scale.amin(0) <= NOISE * scale[0])
-    return stays
 
 
 def scratch_room():
@@ -59,13 +51,15 @@ def scratch_room():
     return point, np.empty((2, 3, 3)), np.empty((2, 3)), (np.empty((HALVINGS + 1, 5, 6)), np.empty(5)), work
 
 
-@jit
+@inlined
 def shared_time(pair, arrays):
     """Return when a pair (receiver, caster) begins and ends to share time, and both as shares of the receiver's."""
     times, slices = arrays[0][2], arrays[1][1]
     r, c = pair
     t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
     length = times[r, 1] - times[r, 0]
+    if length == 0:
+        return t_start, t_start, 0.0, 1.0
     u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
     return t_start, t_end, (t_start - times[r, 0]) / length, u_end
 
@@ -85,16 +79,22 @@ def polynomials(pair, shared, arrays, room):
         for d in range(3):
             _restrict(p[:, d], u_start, u_end)
         _restrict(s, u_start, u_end)
-    for e in range(2):
-        t = t_end if e == 1 else t_start
-        u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
-        for i in range(3):
-            for d in range(3):
-                corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
-        along(shines, t, lamp[e])
+    corners_at(world[c], slices[c], shared, corner)
+    along(shines, t_start, lamp[0])
+    along(shines, t_end, lamp[1])
     if is_directional:
         return _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
     return _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
+
+
+@inlined
+def corners_at(world, times, shared, out):
+    """Write the corners of a caster, (2, 3, 3) at its own `times`, when it begins and ends to share time to `out`."""
+    for e in range(2):
+        u = (shared[e] - times[0]) / (times[1] - times[0])
+        for i in range(3):
+            for d in range(3):
+                out[e, i, d] = (1 - u) * world[0, i, d] + u * world[1, i, d]
 
 
 @inlined
@@ -121,7 +121,7 @@ def _restrict(c, start, end):
 
 
 @inlined
-def _cross_linear(a0, a1, b0, b1, out):
+def cross_linear(a0, a1, b0, b1, out):
     """Write the coefficients (3, 3) of the cross product of linear vectors to `out`."""
     for d in range(3):
         i, j = FIRST[d], SECOND[d]
@@ -148,7 +148,7 @@ def _add_2_3(a, b, sign, out):
 
 
 @inlined
-def _dot_2_1(a, b0, b1, out):
+def dot_2_1(a, b0, b1, out):
     """Write the dot product of vectors of degree 2, (3, 3), and 1 to `out` (4,)."""
     out[:] = 0.0
     for i in range(3):
@@ -159,7 +159,7 @@ def _dot_2_1(a, b0, b1, out):
 
 
 @inlined
-def _largest(rows):
+def largest(rows):
     """Return the greatest absolute value of rows (n, 3)."""
     out = 0.0
     for i in range(len(rows)):
@@ -169,9 +169,9 @@ def _largest(rows):
 
 
 @inlined
-def _largest_corner(corner):
+def largest_corner(corner):
     """Return the greatest absolute value of corners (2, 3, 3)."""
-    return max(_largest(corner[0]), _largest(corner[1]))
+    return max(largest(corner[0]), largest(corner[1]))
 
 
 @jit
@@ -180,8 +180,8 @@ def _from_position(corner, lamp, point, scratch, out):
     p, s, gap = point
     normals, vector, _, rest, _ = scratch
     signs, noise = out
-    size = _largest_corner(corner)
-    reach = _largest(p) + max(s[0], s[1], s[2]) * _largest(lamp)
+    size = largest_corner(corner)
+    reach = largest(p) + max(s[0], s[1], s[2]) * largest(lamp)
     for d in range(3):
         vector[0, d] = p[0, d] - s[0] * lamp[0, d]
         vector[1, d] = p[1, d] - (s[0] * lamp[1, d] + 2 * s[1] * lamp[0, d]) / 3
@@ -190,18 +190,18 @@ def _from_position(corner, lamp, point, scratch, out):
         for i in range(3):
             corner[0, i, d] -= lamp[0, d]
             corner[1, i, d] -= lamp[1, d]
-    size0, size1, size2 = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
+    size0, size1, size2 = largest(corner[:, 0]), largest(corner[:, 1]), largest(corner[:, 2])
     sizes = size0 * size1, size1 * size2, size2 * size0
     signs[:] = 0.0
     volume = rest[0, 0]
     for e in range(3):
         i, j, normal = e, FIRST[e], normals[e]
-        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
+        cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
         _add_dot_2_3(normal, vector, 1.0, signs[e])
         if e == 1:
-            _dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
+            dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
         noise[e] = NOISE * reach * sizes[e]
-        if e > 0 and is_excluded(signs, noise, e + 1):
+        if e > 0 and is_excluded(signs, noise, e + 1, N_COEFFICIENTS):
             return 0
     scale, away, square = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0
     for d in range(3):
@@ -233,9 +233,9 @@ def _along_direction(corner, way, point, scratch, out):
     for d in range(3):
         away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
         square += (0.5 * (way[0, d] + way[1, d])) ** 2
-    away = gap * max(_largest_corner(corner), away / scale)
-    reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
-    size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
+    away = gap * max(largest_corner(corner), away / scale)
+    reach, speed, widest = largest(p), largest(way), max(s[0], s[1], s[2])
+    size = largest(corner[:, 0]), largest(corner[:, 1]), largest(corner[:, 2])
     signs[:] = 0.0
     constant = rest[0, 0]
     for e in range(3):
@@ -244,13 +244,13 @@ def _along_direction(corner, way, point, scratch, out):
             for d in range(3):
                 side[a, d] = corner[a, j, d] - corner[a, i, d]
                 span = max(span, abs(side[a, d]))
-        _cross_linear(way[0], way[1], side[0], side[1], normal)
+        cross_linear(way[0], way[1], side[0], side[1], normal)
         _add_dot_2_3(normal, p, 1.0, signs[e])
-        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], area)
-        _dot_2_1(area, way[0], way[1], constant)
+        cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], area)
+        dot_2_1(area, way[0], way[1], constant)
         _add_2_3(s, constant, 1.0, signs[e])
-        noise[e] = NOISE * speed * (reach * (size[i] + size[j]) + largest * size[i] * size[j])
-        if e > 0 and is_excluded(signs, noise, e + 1):
+        noise[e] = NOISE * speed * (reach * (size[i] + size[j]) + widest * size[i] * size[j])
+        if e > 0 and is_excluded(signs, noise, e + 1, N_COEFFICIENTS):
             return 0
     first, second = rest[1], rest[2]
     for d in range(3):
@@ -260,22 +260,22 @@ def _along_direction(corner, way, point, scratch, out):
         vector[1, d] = p[1, d] - (s[0] * corner[1, 0, d] + 2 * s[1] * corner[0, 0, d]) / 3
         vector[2, d] = p[2, d] - (2 * s[1] * corner[1, 0, d] + s[2] * corner[0, 0, d]) / 3
         vector[3, d] = p[3, d] - s[2] * corner[1, 0, d]
-    _cross_linear(first[0], first[1], second[0], second[1], area)
+    cross_linear(first[0], first[1], second[0], second[1], area)
     _add_dot_2_3(area, vector, 1.0, signs[3])
-    _dot_2_1(area, way[0], way[1], constant)
+    dot_2_1(area, way[0], way[1], constant)
     length = np.sqrt(square)
     _add_2_3(s, constant, -away / (length if length > 0 else 1.0), signs[3])
-    noise[3] = NOISE * span * span * (reach + largest * size[0])
+    noise[3] = NOISE * span * span * (reach + widest * size[0])
     return 4
 
 
 @inlined
-def is_excluded(signs, noise, n_signs):
-    """Return whether the first coefficients `signs` (5, 6), of edges, show that no time has one sign."""
+def is_excluded(signs, noise, n_signs, n):
+    """Return whether the `n` coefficients of the first of `signs` (5, 6), of edges, show that no time has one sign."""
     can_be_up, can_be_down = True, True
     for q in range(n_signs):
         low, high = signs[q, 0], signs[q, 0]
-        for k in range(1, 6):
+        for k in range(1, n):
             low, high = min(low, signs[q, k]), max(high, signs[q, k])
         can_be_up &= high >= -noise[q]
         can_be_down &= low <= noise[q]

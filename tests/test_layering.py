@@ -34,6 +34,7 @@ TORCHBLUR = [
     "atlas",
     "surfaces",
     "prisms",
+    "cpu.bounds",
     "survey",
     "effects",
     "edges",

@@ -14,7 +14,7 @@ from oracle_looks import LookMesh, LookScene
 from oracle_shadows import instant_with_shadows, mean_with_shadows, midpoints
 
 import torchblur as tb
-from torchblur import light_bends, shadow_pairs
+from torchblur import light_bends, nodes, shadow_pairs, shadows
 
 FLOOR = np.array([[-5.0, -5, -1], [5, -5, -1], [5, 6, -1], [-5, 6, -1]])  # its diagonal misses the centre
 TWO = [[0, 1, 2], [0, 2, 3]]
@@ -299,9 +299,15 @@ def test_pairs_that_are_left_out_would_not_have_blocked(monkeypatch):
         assert tb.render(scene).counts["shadow_pairs"] > frame.counts["shadow_pairs"]
 
 
-def test_portions_of_memory_change_nothing():
+def test_portions_of_memory_change_nothing(monkeypatch):
+    find, asked = shadows.find_shadows, []
+    monkeypatch.setattr(nodes, "find_shadows", lambda *a: asked.append(a[1].count) or find(*a))
     scene = lit.to_torch(dataclasses.replace(moving_lamps(), width=24, height=20), casts_shadows=True)
-    whole, tight = tb.render(scene), tb.render(scene, memory_bytes=1 << 22)
+    whole, n_receivers = tb.render(scene), sum(asked)
+    asked.clear()
+    tight = tb.render(scene, memory_bytes=1 << 22)
+    assert len(asked) > 1
+    assert sum(asked) == n_receivers  # each is looked at once, however many portions its shadows ask for
     torch.testing.assert_close(tight.rgba, whole.rgba, rtol=0, atol=1e-12)
     torch.testing.assert_close(tight.shadow, whole.shadow, rtol=0, atol=1e-12)
     assert tight.counts["shadow_ranges"] == whole.counts["shadow_ranges"] > 0

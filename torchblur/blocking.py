@@ -39,6 +39,7 @@ class Receivers:
     scale: Tensor  # (3 or 1, K) of S, which is above 0
     t: Tensor  # (2, K) shutter times of both ends, equal for instants
     face: Tensor  # (K,) int64 face on which the point lies, which does not block it
+    rests: Tensor  # (K,) bool: stays where it is; what does may still count as moving
 
     @property
     def count(self) -> int:
@@ -52,7 +53,7 @@ class Receivers:
 
     def choose(self, chosen: Tensor) -> Receivers:
         """Return the receivers `chosen` (J,)."""
-        return Receivers(self.place[..., chosen], self.scale[:, chosen], self.t[:, chosen], self.face[chosen])
+        return Receivers(*(getattr(self, name)[..., chosen] for name in ("place", "scale", "t", "face", "rests")))
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,7 @@ def _shared_time(receivers: Receivers, casters: Casters, pairs: tuple[Tensor, Te
     if len(part):
         place[..., part] = bernstein.restrict(place[..., part], *share[:, part])
         scale[..., part] = bernstein.restrict(scale[..., part], *share[:, part])
-    return Receivers(place, scale, torch.stack([start, end]), chosen.face), share
+    return Receivers(place, scale, torch.stack([start, end]), chosen.face, chosen.rests), share
 
 
 def _corners(casters: Casters, caster: Tensor, shared: Receivers) -> Tensor:

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchblur import bernstein, check
+from torchblur import check
 from torchblur.accuracy import Accuracy
 from torchblur.prisms import Prisms, build_prisms
 from torchblur.scene import Scene
@@ -139,7 +139,10 @@ def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, r
     prisms, survey = seen
     if away.any():
         chosen = (~away).nonzero().flatten()
-        prisms, survey = prisms.choose(chosen), survey.choose(chosen)
+        names = ["t_open", "face_of", "is_clipped", "bounds_px", "corners_px"]  # what is told of them needs no more
+        names += ["clip"] if accuracy.method != "exact" or prisms.is_clipped.any() else []
+        prisms = replace(prisms, **{name: getattr(prisms, name)[..., chosen] for name in names})
+        survey = survey.choose(chosen)
     surfaces = prisms.surfaces
     textures = [mesh.material.texture for mesh in scene.meshes]
     opacity = []
@@ -164,17 +167,20 @@ def plan_prisms(scene: Scene, seen: tuple[Prisms, Survey], accuracy: Accuracy, r
 
 def _motion(scene: Scene, prisms: Prisms, survey: Survey) -> Effect:
     moving = ~survey.is_still
-    n_moving, n_segments = int(moving.sum()), len(torch.unique(prisms.t_open))
+    n_moving = int(moving.sum())
     if n_moving == 0:
         why = f"all {prisms.count:,} faces in view rest"
     else:
-        path = bernstein.length(prisms.corners_px[:, 3:] - prisms.corners_px[:, :3], 0)[:, moving].nan_to_num(0.0)
-        why = f"{n_moving:,} of {prisms.count:,} prisms move, by up to {float(path.max()):.3g} px"
+        n_segments = len(torch.unique(prisms.t_open)) if bool((prisms.t_open != prisms.t_open[0]).any()) else 1
+        path = (prisms.corners_px[:, 3:] - prisms.corners_px[:, :3]).square().sum(0).nan_to_num(0.0)
+        furthest = float(torch.where(moving, path, 0.0).max()) ** 0.5
+        why = f"{n_moving:,} of {prisms.count:,} prisms move, by up to {furthest:.3g} px"
         why += f", in up to {n_segments} slices of time" if n_segments > 1 else ""
     width, height = scene.camera.width, scene.camera.height
     x0, y0, x1, y1 = prisms.bounds_px
     area = (x1.clamp(max=width) - x0.clamp(min=0)) * (y1.clamp(max=height) - y0.clamp(min=0))
-    areas = [float(area[chosen].sum()) for chosen in (moving, ~moving)]
+    of_moving = float(torch.where(moving, area, 0.0).sum())
+    areas = of_moving, float(area.sum()) - of_moving
     cost = "up to {:,.0f} rays solved in time, {:,.0f} at one instant".format(*areas)
     return Effect("motion", n_moving > 0, why, cost)
 
@@ -234,10 +240,12 @@ def _shadows(prisms: Prisms) -> Effect:
 
 
 def _clipping(prisms: Prisms) -> Effect:
-    z, w = prisms.clip[:, :, 2].flatten(0, 1), prisms.clip[:, :, 3].flatten(0, 1)
-    near, far = (int((side < 0).any(0).sum()) for side in (z + w, w - z))
-    if near + far == 0:
+    clipped = prisms.is_clipped.nonzero().flatten()
+    if len(clipped) == 0:
         return Effect("clipping", False, "no prism reaches the near or the far plane", "none")
+    clipped = prisms.clip[..., clipped]
+    z, w = clipped[:, :, 2].flatten(0, 1), clipped[:, :, 3].flatten(0, 1)
+    near, far = (int((side < 0).any(0).sum()) for side in (z + w, w - z))
     why = f"{near:,} prisms reach the near plane, {far:,} the far plane"
     return Effect("clipping", True, why, "their rays solve two cubics more")
 
@@ -320,7 +328,8 @@ def follow_plan(plan: EffectPlan, prisms: Prisms, survey: Survey, accuracy: Accu
     surfaces = prisms.surfaces
     never = torch.zeros_like(survey.is_still)
     if "curvature" in forced:
-        prisms = replace(prisms, surfaces=replace(surfaces, is_varying=torch.ones_like(surfaces.is_varying)))
+        always = torch.ones_like(surfaces.is_varying)
+        prisms = replace(prisms, surfaces=replace(surfaces, is_varying=always, rests=~always))
     if "clipping" in forced:
         prisms = replace(prisms, is_clipped=~never)
     cuts_matter = accuracy.method != "exact" and bool((surfaces.is_textured | surfaces.is_lit).any())

@@ -22,7 +22,7 @@ from torchblur.effects import EffectPlan
 from torchblur.hidden import find_visible_intervals
 from torchblur.intervals import Intervals
 from torchblur.ledger import Ledger
-from torchblur.nodes import add_shadows, estimate_bytes, estimate_path_bytes, find_varying, place_samples
+from torchblur.nodes import Varying, add_shadows, estimate_bytes, estimate_path_bytes, find_varying, place_samples
 from torchblur.pairs import Block, count_pairs
 from torchblur.paths import cut_at_knots
 from torchblur.prisms import Prisms
@@ -147,32 +147,66 @@ class Exposure:
                 place = block.x0 + pixels % block.width, block.y0 + pixels // block.width
                 yield place, intervals.of_pixels(pixels), None
 
-    def _resolve(
-        self, intervals: Intervals, cells: Cells | None, pixel: tuple[Tensor, Tensor], whole: bool = True
-    ) -> Tensor:
+    def _resolve(self, intervals: Intervals, cells: Cells | None, pixel: tuple[Tensor, Tensor]) -> Tensor:
         """Return (pixels, shutters, N_LOOKS + M) of the pixels at column and row `pixel`, in portions that fit."""
-        camera, device = self.scene.camera, self.scene.device
-        work, (column, row) = self.work, pixel
-        prisms = work.prisms
+        prisms = self.work.prisms
         is_exact = self.accuracy.method == "exact"
-        lines = [s.line_of(column, row, (camera.width, camera.height)) for s in self.shutters]
-        with self.ledger.stage("cells", device):
+        with self.ledger.stage("cells", self.scene.device):
             if cells is None:
-                cells = cut_cells(prisms, intervals, "crossings" in work.plan.simulated)
-                cells = cells if is_exact else cut_at_knots(cells, self._knots(lines))
-        with self.ledger.stage("nodes", device):
-            varying = find_varying(prisms, intervals, cells, self._knots(lines)) if is_exact else None
-            n_bytes = estimate_bytes(prisms, cells, varying)
-        if whole and len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
-            return self._in_portions(intervals, cells, pixel, portions)
-        if varying is not None and prisms.surfaces.casters is not None:
-            with self.ledger.stage("shadows", device):
-                varying = add_shadows(prisms, varying)
-                n_bytes = estimate_bytes(prisms, cells, varying)
-            if len(portions := _portions(n_bytes, self.memory_bytes)) > 1:
-                return self._in_portions(intervals, cells, pixel, portions)
-            self.ledger.add_shadows(varying.shadows)
-        if self.backend == "torch" or not is_exact:
+                cells = cut_cells(prisms, intervals, "crossings" in self.work.plan.simulated)
+                cells = cells if is_exact else cut_at_knots(cells, self._knots(self._lines(pixel)))
+        varying = self._varying(intervals, cells, pixel)
+        portions = self._portions(cells, varying)
+        if len(portions) <= 1:
+            return self._resolve_shadowed(intervals, cells, pixel, varying)
+        parts = []
+        for chosen in portions:
+            *own, of = *cells.of_pixels(intervals, chosen), tuple(place[chosen] for place in pixel)
+            parts.append(self._resolve_shadowed(*own, of, self._varying(*own, of)))
+        return torch.cat(parts)
+
+    def _varying(self, intervals: Intervals, cells: Cells, pixel: tuple[Tensor, Tensor]) -> Varying | None:
+        """Return what varies in cells, where that matters."""
+        if self.accuracy.method != "exact":
+            return None
+        with self.ledger.stage("nodes", self.scene.device):
+            return find_varying(self.work.prisms, intervals, cells, self._knots(self._lines(pixel)))
+
+    def _portions(self, cells: Cells, varying: Varying | None) -> Sequence[Tensor]:
+        """Return runs of the cells' pixels whose samples fit the memory."""
+        with self.ledger.stage("nodes", self.scene.device):
+            return _portions(estimate_bytes(self.work.prisms, cells, varying), self.memory_bytes)
+
+    def _resolve_shadowed(
+        self, intervals: Intervals, cells: Cells, pixel: tuple[Tensor, Tensor], varying: Varying | None
+    ) -> Tensor:
+        """Return what `_resolve` does, with the shadows on `varying` found once for all portions that these ask for."""
+        prisms = self.work.prisms
+        if varying is None or prisms.surfaces.casters is None:
+            return self._resolve_cells(intervals, cells, pixel, varying)
+        with self.ledger.stage("shadows", self.scene.device):
+            varying = add_shadows(prisms, varying)
+        self.ledger.add_shadows(varying.shadows)
+        portions = self._portions(cells, varying)
+        if len(portions) <= 1:
+            return self._resolve_cells(intervals, cells, pixel, varying)
+        receiver_pixel = packed.owners(cells.offsets)[varying.cell[varying.span_of_receivers]]
+        parts = []
+        for chosen in portions:
+            *own, of = *cells.of_pixels(intervals, chosen), tuple(place[chosen] for place in pixel)
+            some = self._varying(*own, of)
+            if some is not None and varying.shadows is not None:
+                on = ((receiver_pixel >= chosen[0]) & (receiver_pixel <= chosen[-1])).nonzero().flatten()
+                some = replace(some, shadows=varying.shadows.choose(on))
+            parts.append(self._resolve_cells(*own, of, some))
+        return torch.cat(parts)
+
+    def _resolve_cells(
+        self, intervals: Intervals, cells: Cells, pixel: tuple[Tensor, Tensor], varying: Varying | None
+    ) -> Tensor:
+        """Return what `_resolve` does, of all cells at once."""
+        prisms, device = self.work.prisms, self.scene.device
+        if self.backend == "torch" or self.accuracy.method != "exact":
             self.ledger.add("cells", len(cells.t_start))
             self.ledger.add("layers", len(cells.layer_interval))
             self.ledger.add("crossings", cells.n_crossings)
@@ -181,24 +215,19 @@ class Exposure:
         self.ledger.add("nodes", len(samples.cell))
         with self.ledger.stage("resolve", device):
             pixel_of = packed.owners(cells.offsets)[samples.cell]
-            offsets = packed.offsets_from_owners(pixel_of, len(column))
+            offsets = packed.offsets_from_owners(pixel_of, len(pixel[0]))
             composite = composite_samples(prisms, intervals, cells, samples, self.accuracy, varying)
             parts = []
-            for shutter, line in zip(self.shutters, lines, strict=True):
+            for shutter, line in zip(self.shutters, self._lines(pixel), strict=True):
                 weight = weigh_samples(shutter, cells, samples, line[pixel_of])
                 done = expose_samples(offsets, composite, weight, len(self.scene.meshes))
                 parts.append(torch.cat([done.rgba, done.light, done.coverage], dim=1))
             return torch.stack(parts, dim=1)
 
-    def _in_portions(
-        self, intervals: Intervals, cells: Cells, pixel: tuple[Tensor, Tensor], portions: Sequence[Tensor]
-    ) -> Tensor:
-        """Return what `_resolve` does, portion by portion of the pixels."""
-        parts = []
-        for chosen in portions:
-            own = tuple(place[chosen] for place in pixel)
-            parts.append(self._resolve(*cells.of_pixels(intervals, chosen), own, False))
-        return torch.cat(parts)
+    def _lines(self, pixel: tuple[Tensor, Tensor]) -> list[Tensor]:
+        """Return shutter by shutter the lines (pixels,) at column and row `pixel`."""
+        camera = self.scene.camera
+        return [s.line_of(*pixel, (camera.width, camera.height)) for s in self.shutters]
 
     def _knots(self, lines: list[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the times (J,) at which the shutters bend, and by how much lines delay them (J, pixels)."""

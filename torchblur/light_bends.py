@@ -76,7 +76,7 @@ class LightPaths:
         """Return the points on the paths, as what light falls on."""
         paths = self.paths
         sign = paths.scale.mean(0).sign()  # of the face on screen
-        return Receivers(sign * self.place, sign * paths.scale, paths.t, paths.face)
+        return Receivers(sign * self.place, sign * paths.scale, paths.t, paths.face, torch.zeros_like(sign).bool())
 
     def due(self, prisms: Prisms) -> tuple[Tensor, ...]:
         """Return light by light (K,) bool: False where the path's surface faces away from it at all times."""

@@ -1,6 +1,6 @@
 """Choose the times at which the cells of a ray are looked at: one for a flat cell, Gauss's nodes where looks vary.
 
-Before: texture_bends.py, light_bends.py.  After: resolve.py.
+Before: texture_bends.py, light_bends.py, resting.py.  After: resolve.py.
 Symbols: C cells, S samples (a time in a cell and how much of it that time stands for), spans (see paths.py), p panels
 (slices of a span in which no look bends). Panels get as many nodes as certificate.py asks for; those for which the most
 do not suffice are halved, towards a time at which a divider vanishes at most MAX_HALVINGS times.
@@ -17,12 +17,14 @@ import torch
 from torch import Tensor
 
 from torchblur import packed
+from torchblur.blocking import Receivers
 from torchblur.cells import Cells
 from torchblur.certificate import SCALE_LIMIT, VECTOR_LIMIT, Divider, nodes_needed
 from torchblur.intervals import Intervals
 from torchblur.light_bends import LightPaths
 from torchblur.paths import Paths, cut_spans, follow
 from torchblur.prisms import Prisms
+from torchblur.resting import Resting
 from torchblur.shadows import Shadows, find_shadows
 from torchblur.sort import SAME_TIME, argsort_by, between
 from torchblur.surfaces import Surfaces
@@ -52,7 +54,7 @@ class Samples:
 
 @dataclass(frozen=True)
 class Varying:
-    """What varies within cells: the paths of their layers whose look depends on time, over spans."""
+    """What varies within cells: the paths of their layers whose look depends on time, over spans; and those at rest."""
 
     cell: Tensor  # (n,) int64 cell of each span
     start: Tensor  # (n,) share of the cell
@@ -62,23 +64,49 @@ class Varying:
     which_textured: Tensor  # which of the paths
     lit: LightPaths
     which_lit: Tensor
-    shadows: Shadows | None = None  # of the lit paths, once they have been found
+    is_followed: Tensor  # (L,) bool of all layers in the cells, whether they have a path
+    rests: Tensor  # (L,) bool, whether they have none but shadows may change them
+    resting: Resting
+    shadows: Shadows | None = None  # of the lit paths, and after them of what rests, once they have been found
 
-    def lit_paths_of(self, cells: Cells, is_varying: Tensor, layer: Tensor, span: Tensor) -> Tensor:
-        """Return which of the lit paths layers are on over spans, -1 for none.
+    @property
+    def span_of_receivers(self) -> Tensor:
+        """The span of each receiver: of the lit paths, and after them of what rests."""
+        return torch.cat([self.lit.paths.span, self.resting.span])
+
+    def receivers(self) -> Receivers:
+        """Return the lit paths, and after them what rests, as what light falls on. Source: ours."""
+        parts = self.lit.receivers(), self.resting.receivers
+        fields = ((getattr(p, name) for p in parts) for name in ("place", "scale", "t", "face", "rests"))
+        return Receivers(*(torch.cat(list(f), dim=-1) for f in fields))
+
+    def due(self, prisms: Prisms) -> tuple[Tensor, ...]:
+        """Return light by light (receivers,) bool: False where the surface faces away at all times. Source: ours."""
+        pairs = zip(self.lit.due(prisms), self.resting.due, strict=True)
+        return tuple(torch.cat(pair) for pair in pairs)
+
+    def receivers_of(self, cells: Cells, layer: Tensor, span: Tensor) -> Tensor:
+        """Return which of the receivers layers (n,) are over the spans (n,) in whose cells they are; -1 for none.
 
         Args:
             cells: in which the layers are.
-            is_varying: (L,) of all layers in the cells, whether their look depends on time.
-            layer: (n,) in the cell of
-            span: (n,).
+            layer: of all.
+            span: of these.
+
+        Source: ours.
         """
-        before = packed.offsets_from_counts(is_varying.long())
-        rank = before[layer] - before[cells.layer_offsets[self.cell[span]]]
-        path = packed.offsets_from_owners(self.paths.span, len(self.cell))[span] + rank
         lit = torch.full((len(self.paths.span) + 1,), -1, dtype=torch.int64, device=span.device)
         lit[self.which_lit] = torch.arange(len(self.which_lit), device=span.device)
-        return torch.where(is_varying[layer], lit[path], -1)
+        found = torch.full_like(span, -1)
+        kinds = (self.is_followed, self.paths.span), (self.rests, self.resting.span)
+        for k, (is_one, span_of) in enumerate(kinds):
+            before = packed.offsets_from_counts(is_one.long())
+            own = is_one[layer].nonzero().flatten()
+            of = span[own]
+            rank = before[layer[own]] - before[cells.layer_offsets[self.cell[of]]]
+            place = packed.offsets_from_owners(span_of, len(self.cell))[of] + rank
+            found[own] = lit[place] if k == 0 else len(self.which_lit) + place
+        return found
 
 
 def middle_samples(cells: Cells) -> Samples:
@@ -104,10 +132,11 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
     """
     surfaces = prisms.surfaces
     face = prisms.face_of[intervals.prism[cells.layer_interval]]
-    if not surfaces.is_varying[face].any():
+    is_varying, rests = surfaces.is_varying[face], surfaces.rests[face]
+    if not is_varying.any():
         return None
-    spans = cut_spans(prisms, intervals, cells, knots)
-    paths = follow(prisms, intervals, cells, spans)
+    spans, is_followed = cut_spans(prisms, cells, is_varying, knots), is_varying & ~rests
+    paths = follow(prisms, intervals, cells, spans, is_followed)
     which_textured = surfaces.is_textured[paths.face].nonzero().flatten()
     is_lit = surfaces.is_lit[paths.face] if surfaces.lights else torch.zeros_like(paths.span, dtype=torch.bool)
     which_lit = is_lit.nonzero().flatten()
@@ -120,16 +149,18 @@ def find_varying(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tupl
         which_textured=which_textured,
         lit=LightPaths.of(prisms, paths.choose(which_lit)),
         which_lit=which_lit,
+        is_followed=is_followed,
+        rests=rests,
+        resting=Resting.of(prisms, intervals, cells, spans, rests),
     )
 
 
 @torch.no_grad()
-def add_shadows(prisms: Prisms, varying: Varying | None) -> Varying | None:
+def add_shadows(prisms: Prisms, varying: Varying) -> Varying:
     """Return what varies with the shadows on it, where there are any. Source: ours."""
-    if varying is None or prisms.surfaces.casters is None or len(varying.which_lit) == 0:
+    if prisms.surfaces.casters is None or len(varying.span_of_receivers) == 0:
         return varying
-    lit = varying.lit
-    return replace(varying, shadows=find_shadows(prisms.surfaces, lit.receivers(), lit.due(prisms)))
+    return replace(varying, shadows=find_shadows(prisms.surfaces, varying.receivers(), varying.due(prisms)))
 
 
 @torch.no_grad()
@@ -147,7 +178,7 @@ def estimate_bytes(prisms: Prisms, cells: Cells, varying: Varying | None) -> Ten
         nodes[varying.lit.paths.span] = FEW_LIT
         if varying.shadows is not None:
             which, _ = varying.shadows.ends(surfaces)
-            panels = panels + torch.bincount(varying.lit.paths.span[which], minlength=len(panels))
+            panels = panels + torch.bincount(varying.span_of_receivers[which], minlength=len(panels))
         of_cell = n_layers * BYTES_PER_LAYER
         of_cell = of_cell.index_add(0, varying.cell, panels * nodes * n_layers[varying.cell] * BYTES_PER_LOOK)
     return packed.sum_by_owner(of_cell, cells.offsets)
@@ -260,7 +291,7 @@ def _cut_panels(prisms: Prisms, varying: Varying) -> tuple[Tensor, Tensor, Tenso
         taus.append(tau[inside])
     if varying.shadows is not None:
         which, tau = varying.shadows.ends(prisms.surfaces)
-        owners.append(varying.lit.paths.span[which])
+        owners.append(varying.span_of_receivers[which])
         taus.append(tau)
     return between(torch.cat(owners), torch.cat(taus))
 

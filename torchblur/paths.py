@@ -57,20 +57,19 @@ class Paths:
         return bernstein.product(self.e.unsqueeze(2), at_ends).sum(1)
 
 
-def cut_spans(prisms: Prisms, intervals: Intervals, cells: Cells, knots: tuple[Tensor, Tensor]) -> Spans:
+def cut_spans(prisms: Prisms, cells: Cells, is_varying: Tensor, knots: tuple[Tensor, Tensor]) -> Spans:
     """Return the spans of the cells in which a look depends on time.
 
     Args:
         prisms: of the scene.
-        intervals: from which the cells were cut.
         cells: with their visible layers.
+        is_varying: (L,) bool of all layers, whether their look depends on time.
         knots: shutter times at which a shutter bends (J,), and by how much a line delays each for every pixel
             (J, pixels).
 
     Source: ours.
     """
-    face = prisms.face_of[intervals.prism[cells.layer_interval]]
-    cell = torch.unique(packed.owners(cells.layer_offsets)[prisms.surfaces.is_varying[face]])
+    cell = torch.unique_consecutive(packed.owners(cells.layer_offsets)[is_varying])
     pixel = packed.owners(cells.offsets)[cell]
     times, delays = knots
     still = torch.tensor(sorted({t for light in prisms.surfaces.lights for t in light.knots}), dtype=torch.float64)
@@ -113,15 +112,14 @@ def _slices(cells: Cells, cell: Tensor, times: list[Tensor]) -> tuple[Tensor, Te
     return between(torch.cat(owners), torch.cat(taus))
 
 
-def follow(prisms: Prisms, intervals: Intervals, cells: Cells, spans: Spans) -> Paths:
-    """Return the paths of the layers in the cells of `spans` whose look varies with time. Source: ours."""
+def follow(prisms: Prisms, intervals: Intervals, cells: Cells, spans: Spans, is_followed: Tensor) -> Paths:
+    """Return the paths of those layers in the cells of `spans` that, of all, `is_followed` (L,) tells. Source: ours."""
     counts = cells.layer_offsets.diff()[spans.cell]
     layer, span = packed.expand(cells.layer_offsets[spans.cell], counts)
-    interval = cells.layer_interval[layer]
-    face = prisms.face_of[intervals.prism[interval]]
-    varying = prisms.surfaces.is_varying[face].nonzero().flatten()
-    interval, span, face = interval[varying], span[varying], face[varying]
+    chosen = is_followed[layer].nonzero().flatten()
+    interval, span = cells.layer_interval[layer[chosen]], span[chosen]
     prism = intervals.prism[interval]
+    face = prisms.face_of[prism]
     t = spans.t[:, span]
     u = (t - prisms.t_open[prism]) / (prisms.t_close - prisms.t_open)[prism]
     ray = intervals.ray_ndc[:, intervals.pixel_of(interval)]

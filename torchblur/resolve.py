@@ -76,9 +76,8 @@ def composite_samples(
         points = points_on_prisms(prisms, intervals, interval[which], samples.t[sample[which]])
         known = None
         if varying is not None and varying.shadows is not None:
-            is_varying = surfaces.is_varying[prisms.face_of[intervals.prism[cells.layer_interval]]]
-            paths = varying.lit_paths_of(cells, is_varying, layer[which], samples.span[sample[which]])
-            known = varying.shadows, paths, samples.tau[sample[which]]
+            receivers = varying.receivers_of(cells, layer[which], samples.span[sample[which]])
+            known = varying.shadows, receivers, samples.tau[sample[which]]
         seen = look(surfaces, face, which, with_shadows(surfaces, points, known))
     else:
         seen = look_over(prisms, intervals, cells, (samples.cell[sample], interval))

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -19,14 +19,15 @@ from torch import Tensor
 from torchblur import bernstein, packed
 from torchblur.blocking import Receivers
 from torchblur.casters import Casters
-from torchblur.cpu.join import join
-from torchblur.cpu.sieve import arrays_of
+from torchblur.cpu.join import Found, join
+from torchblur.cpu.sides import arrays_of
 from torchblur.lights import DirectionalLight, Light, along, unit
 from torchblur.prisms import swept_bounds_px
 
 FINEST = 10  # level
 AT_ONCE = 1 << 15  # pairs looked at together: 30 MB, which caches hold in part
 FEW_PAIRS = 1 << 17  # below, all pairs are looked at; cells would take longer
+PARTS = 8  # of a caster's time in which bounds are found, too: what moves fills little of what it sweeps
 SIDE = 2  # [-1, 1] is how wide the side of a cube is, from 0 to 2 in the units of `swept_bounds_px`
 NEAR = 1e-12  # of the casters' extent: nothing is nearer to a light
 SLACK = 1e-9  # of the casters' extent: widening of bounds against rounding
@@ -40,10 +41,13 @@ class _Swept:
     low: Tensor  # (2, n) float64
     high: Tensor  # (2, n)
     depth: Tensor  # (n,) from the light: the least of a caster, the greatest of a receiver
+    parts: (
+        Tensor  # (PARTS or 0, 4, n) least and greatest x and y of a caster in each part of its time; none of receivers
+    )
 
     def choose(self, chosen: Tensor) -> _Swept:
         """Return the things `chosen` (J,)."""
-        return _Swept(self.which[chosen], self.low[:, chosen], self.high[:, chosen], self.depth[chosen])
+        return _Swept(*(getattr(self, name)[..., chosen] for name in ("which", "low", "high", "depth", "parts")))
 
 
 def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[Tensor, Tensor]]:
@@ -62,21 +66,32 @@ def candidate_pairs(light: Light, receivers: Receivers, casters: Casters) -> Ite
         yield together(kept)
 
 
-def sifted_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[tuple[Tensor, Tensor], int]]:
-    """Yield those of `candidate_pairs`, in its order, that may block the light by a closer look, and how many it has:
-    compiled, for tensors on the CPU. Source: ours.
+def blocked_ranges(
+    light: Light, receivers: Receivers, casters: Casters, hides: Tensor
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], int]:
+    """Return receiver, caster, start and end (R,) of the shares of the receivers' slices in which `candidate_pairs`
+    block the light, and how many pairs were looked at: compiled, for tensors on the CPU.
+
+    Args:
+        light: that shines.
+        receivers: K points.
+        casters: C triangles.
+        hides: (C,) bool, which of them are opaque: what these block, others need not be looked at for.
+
+    Source: ours.
     """
     views = _directional_views if isinstance(light, DirectionalLight) else _cube_views
-    faces = receivers.face.contiguous().numpy(), casters.face.contiguous().numpy()
+    faces = receivers.face.contiguous().numpy(), casters.face.contiguous().numpy(), hides.contiguous().numpy()
     arrays = faces, arrays_of(light, receivers, casters)
+    found, n_seen = Found.nothing(receivers.count, casters.count), 0
     for view in views(light, receivers, casters):
         things = _in_common_box(*view)
         n, m = (len(thing.which) for thing in things)
         if n * m:
-            boxes = ((t.which, torch.cat([t.low, t.high, t.depth.unsqueeze(0)]), _level(t)) for t in things)
-            (r, c), n_seen = join(*boxes, n * m <= FEW_PAIRS, arrays)
-            for start in range(0, max(len(r), 1), AT_ONCE):
-                yield (r[start : start + AT_ONCE], c[start : start + AT_ONCE]), 0 if start else n_seen
+            boxes = ((t.which, torch.cat([t.low, t.high, t.depth.unsqueeze(0)]), _level(t), t.parts) for t in things)
+            found, more = join(*boxes, n * m <= FEW_PAIRS, arrays, found)
+            n_seen += more
+    return found.rows(), n_seen
 
 
 def together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
@@ -95,13 +110,14 @@ def _cube_views(light: Light, receivers: Receivers, casters: Casters) -> Iterato
     scale = _raised(receivers.scale, len(vector))
     for axis, side in itertools.product(range(3), (1.0, -1.0)):
         a, b = (k for k in range(3) if k != axis)
-        w = side * corners[:, :, axis]
-        clip = torch.stack([corners[:, :, a], -corners[:, :, b], w, w], dim=2)
-        bounds = swept_bounds_px(clip, w - NEAR * casters.extent, SIDE, SIDE)
-        every = torch.arange(casters.count, device=w.device)
-        caster = _in_side(every, bounds[:2], bounds[2:], w.amin((0, 1)))
+        axes = a, b, axis, side
+        bounds = _on_side(corners, axes, casters.extent)
+        every = torch.arange(casters.count, device=bounds.device)
+        caster = _in_side(every, bounds[:2], bounds[2:], (side * corners[:, :, axis]).amin((0, 1)))
         if len(caster.which) == 0:
             continue
+        parts = _on_side(_in_parts(corners[..., caster.which]), axes, casters.extent)
+        caster = replace(caster, parts=parts.reshape(4, PARTS, -1).transpose(0, 1))
         depth = side * vector[:, axis]
         is_ahead = (depth > 0).any(0).nonzero().flatten()
         depth = depth[:, is_ahead]
@@ -110,10 +126,30 @@ def _cube_views(light: Light, receivers: Receivers, casters: Casters) -> Iterato
         yield _in_side(is_ahead, low + 1, high + 1, furthest), caster
 
 
+def _in_parts(linear: Tensor) -> Tensor:
+    """Return (2, ..., PARTS * n) values at the ends of each part of a time in which (2, ..., n) change linearly."""
+    u = torch.linspace(0, 1, PARTS + 1, dtype=linear.dtype, device=linear.device).unsqueeze(1)
+    at = (1 - u) * linear[0].unsqueeze(-2) + u * linear[1].unsqueeze(-2)  # (..., PARTS + 1, n)
+    return torch.stack([at[..., :-1, :], at[..., 1:, :]]).flatten(-2)
+
+
+def _on_side(corners: Tensor, axes: tuple[int, int, int, float], extent: float) -> Tensor:
+    """Return the bounds (4, n) of corners (2, 3, 3, n) on a side of the cube: axes across, axis and sign along."""
+    a, b, axis, side = axes
+    w = side * corners[:, :, axis]
+    clip = torch.stack([corners[:, :, a], -corners[:, :, b], w, w], dim=2)
+    return swept_bounds_px(clip, w - NEAR * extent, SIDE, SIDE)
+
+
 def _in_side(which: Tensor, low: Tensor, high: Tensor, depth: Tensor) -> _Swept:
     """Return what overlaps a side of the cube, cut to it."""
     met = ((low <= SIDE) & (high >= 0)).all(0).nonzero().flatten()
-    return _Swept(which, low.clamp(min=0), high.clamp(max=SIDE), depth).choose(met)
+    return _Swept(which, low.clamp(min=0), high.clamp(max=SIDE), depth, _no_parts(which)).choose(met)
+
+
+def _no_parts(which: Tensor) -> Tensor:
+    """Return the bounds in parts of things `which` (n,) that are not divided."""
+    return torch.zeros(0, 4, len(which), dtype=torch.float64, device=which.device)
 
 
 def _ahead(numerator: Tensor, depth: Tensor) -> tuple[Tensor, Tensor]:
@@ -135,15 +171,21 @@ def _directional_views(light: Light, receivers: Receivers, casters: Casters) -> 
         until = torch.inf if k == len(knots) - 2 else end
         own, of = (((t.mean(0) >= start) & (t.mean(0) < until)).nonzero().flatten() for t in (receivers.t, ends))
         axes = _axes(along(light.direction, torch.stack([start, end])))
-        one = torch.ones(1, len(of), dtype=torch.float64, device=of.device)
-        way = torch.stack([along(light.direction, t) for t in ends[:, of]])
-        seen = [_sheared(corners[:, c][..., of], one, way, axes) for c in range(3)]
-        low, high, least, _ = (torch.stack(s) for s in zip(*seen, strict=True))
-        slack = SLACK * casters.extent
-        caster = _Swept(of, low.amin(0) - slack, high.amax(0) + slack, least.amin(0))
+        way, slack = torch.stack([along(light.direction, t) for t in ends[:, of]]), SLACK * casters.extent
+        bounds, least = _on_plane(corners[..., of], way, axes, slack)
+        parts, _ = _on_plane(_in_parts(corners[..., of]), _in_parts(way), axes, slack)
+        caster = _Swept(of, bounds[:2], bounds[2:], least, parts.reshape(4, PARTS, -1).transpose(0, 1))
         way = torch.stack([along(light.direction, t) for t in times[:, own]])
         low, high, _, most = _sheared(place[..., own], receivers.scale[:, own], way, axes)
-        yield _Swept(own, low, high, most), caster
+        yield _Swept(own, low, high, most, _no_parts(own)), caster
+
+
+def _on_plane(corners: Tensor, way: Tensor, axes: Tensor, slack: float) -> tuple[Tensor, Tensor]:
+    """Return the bounds (4, n) of corners (2, 3, 3, n) moved along the light's `way` (2, 3, n), and the least depth."""
+    one = torch.ones(1, way.shape[-1], dtype=torch.float64, device=way.device)
+    seen = [_sheared(corners[:, c], one, way, axes) for c in range(3)]
+    low, high, least, _ = (torch.stack(s) for s in zip(*seen, strict=True))
+    return torch.cat([low.amin(0) - slack, high.amax(0) + slack]), least.amin(0)
 
 
 def _axes(directions: Tensor) -> Tensor:
@@ -224,8 +266,11 @@ def _in_common_box(*things: _Swept) -> list[_Swept]:
     for thing in things:
         met = ((thing.low <= last.unsqueeze(1)) & (thing.high >= first.unsqueeze(1))).all(0).nonzero().flatten()
         part = thing.choose(met)
-        bounds = ((c - base.unsqueeze(1)) / size.unsqueeze(1) for c in (part.low, part.high))
-        out.append(_Swept(part.which, *(b.clamp(0.0, 1.0) for b in bounds), part.depth))
+        bounds = (
+            (c - base.unsqueeze(1)) / size.unsqueeze(1) for c in (part.low, part.high, *part.parts.split(2, dim=1))
+        )
+        low, high, *parts = (b.clamp(0.0, 1.0) for b in bounds)
+        out.append(_Swept(part.which, low, high, part.depth, torch.cat(parts, dim=1)))
     return out
 
 

@@ -10,7 +10,6 @@ Source: Hong & Oh 2018 (ranges of time); Aila & Laine 2004 (points of view as sa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -18,10 +17,9 @@ from torch import Tensor
 
 from torchblur import packed
 from torchblur.blocking import Receivers, when_blocked
-from torchblur.casters import Casters
 from torchblur.lights import DirectionalLight, Light, along
 from torchblur.shading import Points
-from torchblur.shadow_pairs import candidate_pairs, sifted_pairs
+from torchblur.shadow_pairs import blocked_ranges, candidate_pairs
 from torchblur.sort import SAME_TIME, argsort_by
 from torchblur.stopwatch import spent_on
 from torchblur.surfaces import Surfaces
@@ -41,6 +39,11 @@ class Ranges:
     end: Tensor  # (R,)
     caster: Tensor  # (R,) int64; NOTHING where opaque
 
+    def choose(self, chosen: Tensor) -> Ranges:
+        """Return the ranges of the receivers `chosen` (J,)."""
+        index, offsets = packed.select(self.offsets, chosen)
+        return Ranges(offsets, self.start[index], self.end[index], self.caster[index])
+
 
 @dataclass(frozen=True)
 class Shadows:
@@ -48,6 +51,10 @@ class Shadows:
 
     ranges: tuple[Ranges | None, ...]  # light by light; None for one that casts no shadows
     n_pairs: int  # of receivers and casters that were looked at
+
+    def choose(self, chosen: Tensor) -> Shadows:
+        """Return what the receivers `chosen` (J,) get; of the pairs, all that were looked at."""
+        return Shadows(tuple(r.choose(chosen) if r else None for r in self.ranges), self.n_pairs)
 
     @property
     def n_ranges(self) -> int:
@@ -137,22 +144,25 @@ def find_shadows(surfaces: Surfaces, receivers: Receivers, is_due: tuple[Tensor,
             continue
         own = due.nonzero().flatten()
         chosen = receivers.choose(own)
-        parts = [(own[:0], own[:0], receivers.t[0, :0], receivers.t[0, :0])]
-        for (receiver, caster), n in _likely_pairs(light, chosen, surfaces.casters):
-            n_pairs += n
-            which, start, end = when_blocked(light, chosen, surfaces.casters, (receiver, caster))
-            parts.append((own[receiver[which]], caster[which], start, end))
-        found.append(_united(surfaces, receivers.count, *(torch.cat(p) for p in zip(*parts, strict=True))))
+        (receiver, caster, start, end), n = _blocked(surfaces, light, chosen)
+        n_pairs += n
+        found.append(_united(surfaces, receivers.count, own[receiver], caster, start, end))
     return Shadows(tuple(found), n_pairs)
 
 
-def _likely_pairs(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[tuple[Tensor, Tensor], int]]:
-    """Yield the pairs that may block a light, in portions, and how many candidates these were among."""
+def _blocked(
+    surfaces: Surfaces, light: Light, receivers: Receivers
+) -> tuple[tuple[Tensor, Tensor, Tensor, Tensor], int]:
+    """Return receiver, caster, start and end (R,) of what blocks a light, and how many pairs were looked at."""
+    casters = surfaces.casters
     if receivers.count * casters.count >= MANY and receivers.face.device.type == "cpu":
-        yield from sifted_pairs(light, receivers, casters)
-    else:
-        for pairs in candidate_pairs(light, receivers, casters):
-            yield pairs, len(pairs[0])
+        return blocked_ranges(light, receivers, casters, surfaces.is_opaque[casters.face])
+    parts, n_pairs = [(receivers.face[:0], receivers.face[:0], receivers.t[0, :0], receivers.t[0, :0])], 0
+    for receiver, caster in candidate_pairs(light, receivers, casters):
+        which, start, end = when_blocked(light, receivers, casters, (receiver, caster))
+        parts.append((receiver[which], caster[which], start, end))
+        n_pairs += len(receiver)
+    return tuple(torch.cat(p) for p in zip(*parts, strict=True)), n_pairs
 
 
 def visible_at(surfaces: Surfaces, point: Tensor, t: Tensor, face: Tensor) -> Tensor | None:
@@ -170,8 +180,9 @@ def visible_at(surfaces: Surfaces, point: Tensor, t: Tensor, face: Tensor) -> Te
     if surfaces.casters is None:
         return None
     now = t.detach()
-    receivers = Receivers(point.detach().unsqueeze(0), torch.ones_like(now).unsqueeze(0), torch.stack([now, now]), face)
     every = torch.ones_like(face, dtype=torch.bool)
+    place, scale = point.detach().unsqueeze(0), torch.ones_like(now).unsqueeze(0)
+    receivers = Receivers(place, scale, torch.stack([now, now]), face, every)
     shadows = find_shadows(surfaces, receivers, (every,) * len(surfaces.lights))
     return shadows.visibility(surfaces, torch.arange(len(t), device=t.device), torch.zeros_like(now), (point, t))
 

@@ -33,6 +33,7 @@ class Surfaces:
     uv: Tensor  # (F, 3, 2) float64 texture coordinates of the corners; 0 without texture
     atlas: Atlas
     is_varying: Tensor  # (F,) bool: its look may change while the shutter is open
+    rests: Tensor  # (F,) bool: lit, and only by the shadows on it
     is_lit: Tensor  # (F,) bool: shows its colour times the light that it gets
     has_normals: Tensor  # (F,) bool: its corners have normals; otherwise it is flat
     lights: tuple[Light, ...]
@@ -70,11 +71,13 @@ def build_surfaces(scene: Scene) -> Surfaces:
     lights_move = any(p.ndim == 2 for light in scene.lights for p in light.tensors().values())
     casters = find_casters(scene)
     light_changes = lights_move or (casters is not None and casters.moves)
+    casts = casters is not None and casters.moves and not lights_move
     varying = [
         (m.material.texture is not None and not scene.is_still(m))
         or (m.material.shading == "lambert" and bool(scene.lights) and (light_changes or not scene.is_still(m)))
         for m in meshes
     ]
+    is_lit = per_face([m.material.shading == "lambert" for m in meshes])
     return Surfaces(
         rgb=cat([m.face_rgb() for m in meshes], (0, 3), f64),
         opacity=opacity,
@@ -87,7 +90,8 @@ def build_surfaces(scene: Scene) -> Surfaces:
         uv=cat([_face_uv(m) for m in meshes], (0, 3, 2), f64),
         atlas=build_atlas(meshes, device),
         is_varying=per_face(varying),
-        is_lit=per_face([m.material.shading == "lambert" for m in meshes]),
+        rests=is_lit & per_face([casts and scene.is_still(m) for m in meshes]),
+        is_lit=is_lit,
         has_normals=per_face([m.normals is not None for m in meshes]),
         lights=scene.lights,
         casters=casters,

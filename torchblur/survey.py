@@ -1,6 +1,6 @@
 """What prisms can do at most: cheap conservative bounds by which effects are left out.
 
-Before: prisms.py.  After: hidden.py, effects.py.
+Before: prisms.py, cpu/bounds.py.  After: hidden.py, effects.py.
 Symbols: P prisms; D(t) = det(p_0, p_1, p_2) of their clip-space corners without z, a cubic whose sign is the facing.
 Nearness as in intervals.py: larger in front, between those of the six corners while all w are above 0.
 Source: signs of Bernstein coefficients; bounds by corners: the hit point is a mean of them. Ours.
@@ -14,11 +14,13 @@ import torch
 from torch import Tensor
 
 from torchblur import bernstein, packed
+from torchblur.cpu import bounds
 from torchblur.prisms import Prisms
 
 NOISE = 1e-13  # of the product of the corners' sizes: smaller D may be rounding
 GRIDS = (32, 16, 8, 4, 2, 1)  # tiles along a side
 TOUCHING = 1e-12  # of the nearness: smaller overlaps are rounding, as in cells.py
+MANY = 1 << 10  # prisms; fewer are not worth loading compiled code
 MAX_PLACES = 8  # a prism and slice of time on average, else the grid is coarser
 
 
@@ -42,22 +44,31 @@ class Survey:
 def survey_prisms(prisms: Prisms, size_px: tuple[int, int]) -> Survey:
     """Return the bounds of all prisms on an image of width and height `size_px`. Source: ours."""
     start, end = prisms.window
-    rests = (prisms.clip[0] == prisms.clip[1]).all(0).all(0)
     whole = (prisms.t_open == start) & (prisms.t_close == end)
-    nearness, facing = _nearness_range(prisms), _facing(prisms)
-    away = shows_back(prisms, facing)
+    rests, facing, nearness = _bounds(prisms)
     is_still = rests & whole & ~prisms.is_clipped
-    seen = (prisms, nearness, ~is_still)
-    if away.any():
-        chosen = (~away).nonzero().flatten()
-        seen = (prisms.choose(chosen), nearness[:, chosen], ~is_still[chosen])
     return Survey(
         is_still=is_still,
         hides=prisms.surfaces.is_opaque[prisms.face_of],
         facing=facing,
         nearness=nearness,
-        may_cross=_may_cross(*seen, size_px),
+        may_cross=_may_cross(prisms, (nearness, ~is_still, shows_back(prisms, facing)), size_px),
     )
+
+
+def _is_compiled(prisms: Prisms) -> bool:
+    """Return whether prisms are looked at one by one, by compiled code."""
+    return prisms.count >= MANY and prisms.clip.device.type == "cpu"
+
+
+def _bounds(prisms: Prisms) -> tuple[Tensor, Tensor, Tensor]:
+    """Return whether prisms do not move on screen (P,), their facing (P,) and nearness (2, P)."""
+    if _is_compiled(prisms):
+        flags = prisms.parity.detach().numpy(), prisms.is_clipped.numpy()
+        found = bounds.bound(prisms.clip.detach().numpy(), flags, prisms.orders_by_w, NOISE)
+        return tuple(torch.from_numpy(part) for part in found)
+    rests = (prisms.clip[0] == prisms.clip[1]).all(0).all(0)
+    return rests, _facing(prisms), _nearness_range(prisms)
 
 
 def shows_back(prisms: Prisms, facing: Tensor) -> Tensor:
@@ -90,17 +101,27 @@ def _facing(prisms: Prisms) -> Tensor:
     return torch.where(prisms.is_clipped, 0, sure)
 
 
-def _may_cross(prisms: Prisms, nearness: Tensor, moves: Tensor, size_px: tuple[int, int]) -> bool:
+def _may_cross(prisms: Prisms, known: tuple[Tensor, Tensor, Tensor], size_px: tuple[int, int]) -> bool:
     """Return whether the nearness of two prisms overlaps in a tile of the screen and slice of time in which one moves.
 
     Ranges that only touch keep their order: those of faces in one plane at rest in depth, or one in front of another.
+    `known` are the nearness (2, P), whether each moves (P,), and whether each is left out (P,).
     """
+    nearness, moves, is_out = known
     if prisms.count < 2 or not moves.any():
         return False
-    knots = torch.unique(torch.cat([prisms.t_open, prisms.t_close]))
-    slices = [torch.searchsorted(knots, t) for t in (prisms.t_open, prisms.t_close)]
+    knots, slices = _slices(prisms)
+    if _is_compiled(prisms):
+        seen = (part.detach().numpy() for part in (prisms.bounds_px, *known))
+        rules = GRIDS, MAX_PLACES, TOUCHING
+        return bounds.may_cross(tuple(seen), (*(s.numpy() for s in slices), len(knots) - 1), size_px, rules)
+    chosen = (~is_out).nonzero().flatten()
+    prisms, nearness, moves = prisms.choose(chosen), nearness[:, chosen], moves[chosen]
+    if prisms.count < 2 or not moves.any():
+        return False
+    slices = [part[chosen] for part in slices]
     n_slices = slices[1] - slices[0]
-    size = torch.tensor(size_px, dtype=torch.float64, device=knots.device).unsqueeze(1)
+    size = torch.tensor(size_px, dtype=torch.float64, device=nearness.device).unsqueeze(1)
     low, high = (torch.minimum(b.clamp(min=0), size) / size for b in (prisms.bounds_px[:2], prisms.bounds_px[2:]))
     for n in GRIDS:
         first, last = ((b * n).floor().clamp(max=n - 1).long() for b in (low, high))
@@ -113,7 +134,7 @@ def _may_cross(prisms: Prisms, nearness: Tensor, moves: Tensor, size_px: tuple[i
     row = first[1, of] + index // spans[0, of] % spans[1, of]
     time = slices[0][of] + index // (spans[0] * spans[1])[of]
     place = (time * n + row) * n + column
-    is_lively = torch.zeros((len(knots) - 1) * n * n, dtype=torch.bool, device=knots.device)
+    is_lively = torch.zeros((len(knots) - 1) * n * n, dtype=torch.bool, device=place.device)
     is_lively[place[moves[of]]] = True
     lively = is_lively[place].nonzero().flatten()
     place, of = place[lively], of[lively]
@@ -128,3 +149,15 @@ def _may_cross(prisms: Prisms, nearness: Tensor, moves: Tensor, size_px: tuple[i
     place, (least, greatest) = place[order], nearness[:, of[order]]
     # sorted by their least, two overlap somewhere just if two neighbours do
     return bool(((place[1:] == place[:-1]) & (least[1:] * (1 + TOUCHING) < greatest[:-1])).any())
+
+
+def _slices(prisms: Prisms) -> tuple[Tensor, list[Tensor]]:
+    """Return the times (n + 1,) between which no prism begins or ends, and the first slice of each (P,) and the first
+    after it (P,).
+    """
+    start, end = prisms.window
+    if bool((prisms.t_open == start).all()) and bool((prisms.t_close == end).all()):
+        first = torch.zeros_like(prisms.face_of)
+        return torch.tensor([start, end]), [first, first + 1]
+    knots = torch.unique(torch.cat([prisms.t_open, prisms.t_close]))
+    return knots, [torch.searchsorted(knots, t) for t in (prisms.t_open, prisms.t_close)]

@@ -1,260 +1,23 @@
 """Which pairs of receivers and casters may block a light at all, compiled: most candidates do not.
 
-Before: jit.py, blocking.py.  After: join.py.
-Symbols: as in blocking.py, whose tests these are in the same arithmetic: a pair is left out only where the Bernstein
-coefficients show, on every slice that is looked at, that no time has all signs alike.
+Before: sides.py.  After: join.py.
+Symbols: as in blocking.py; a pair is left out only where the Bernstein coefficients show, on every slice that is looked
+at, that no time has all signs alike.
 Source: ours.
 """
 
 from __future__ import annotations
 
-import numpy as np
-import torch
+from torchblur.blocking import HALVINGS
+from torchblur.cpu.jit import jit
 
-from torchblur.blocking import HALVINGS, NOISE, Receivers
-from torchblur.casters import Casters
-from torchblur.cpu.jit import inlined, jit
-from torchblur.lights import DirectionalLight, Light
-
-ROOM = 16.0  # times the rounding that blocking.py allows for: what is left out there is left out, nothing else
-FIVE_OF_2_3 = np.array([[1.0, 0.6, 0.3, 0.1, 0.0, 0.0], [0.0, 0.4, 0.6, 0.6, 0.4, 0.0], [0.0, 0.0, 0.1, 0.3, 0.6, 1.0]])
-FIRST, SECOND = np.array([1, 2, 0]), np.array([2, 0, 1])  # of a cross product; also the corners of the edges
-
-
-def arrays_of(light: Light, receivers: Receivers, casters: Casters) -> tuple[tuple, tuple, tuple]:
-    """Return what `may_block` reads of receivers, casters and a light; each thing's numbers lie side by side."""
-    is_directional = isinstance(light, DirectionalLight)
-    shines = (light.direction if is_directional else light.position).detach().to(torch.float64).reshape(-1, 3)
-    thing = [a.contiguous().numpy() for a in (receivers.place.permute(2, 0, 1), receivers.scale.T, receivers.t.T)]
-    slices = torch.stack([casters.t_open, casters.t_close], dim=1)
-    world = casters.world.permute(3, 0, 1, 2).contiguous()
-    return tuple(thing), (world.numpy(), slices.numpy(), casters.gap), (shines.contiguous().numpy(), is_directional)
-
-
-def scratch_room():
-    """Return what `may_block` works in."""
-    point = np.empty((4, 3)), np.empty(3)
-    work = np.empty((3, 3)), np.empty((4, 3)), np.empty((3, 3)), np.empty((3, 2, 4))
-    return point, np.empty((2, 3, 3)), np.empty((2, 3)), (np.empty((HALVINGS + 1, 5, 6)), np.empty(5)), work
+N_EDGES = 3  # of the signs: an edge that is 0 may count as either sign
 
 
 @jit
-def may_block(pair, arrays, room):
-    """Return whether a pair (receiver, caster) that shares some time may block the light."""
-    r, c = pair
-    (place, scale, times), (world, slices, gap), (shines, is_directional) = arrays
-    (p, s), corner, lamp, (signs, noise), scratch = room
-    is_instant = place.shape[1] == 1
-    t_start, t_end = max(times[r, 0], slices[c, 0]), min(times[r, 1], slices[c, 1])
-    if is_instant:
-        p[:] = place[r, 0]
-        s[:] = scale[r, 0]
-    else:
-        p[:] = place[r]
-        s[:] = scale[r]
-        length = times[r, 1] - times[r, 0]
-        u_start = (t_start - times[r, 0]) / length
-        u_end = 1.0 if t_end == times[r, 1] else (t_end - times[r, 0]) / length
-        if u_start > 0 or u_end < 1:
-            for d in range(3):
-                _restrict(p[:, d], u_start, u_end)
-            _restrict(s, u_start, u_end)
-    for e in range(2):
-        t = t_end if e == 1 and not is_instant else t_start
-        u = (t - slices[c, 0]) / (slices[c, 1] - slices[c, 0])
-        for i in range(3):
-            for d in range(3):
-                corner[e, i, d] = (1 - u) * world[c, 0, i, d] + u * world[c, 1, i, d]
-        _along(shines, t, lamp[e])
-    if is_directional:
-        n_signs = _along_direction(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
-    else:
-        n_signs = _from_position(corner, lamp, (p, s, gap), scratch, (signs[0], noise))
-    return n_signs > 0 and _may_be_alike(signs, noise, n_signs, 0 if is_instant else HALVINGS)
-
-
-@inlined
-def _along(knots, t, out):
-    """Write the value of knots (n, 3) at the shutter time `t` to `out` (3,)."""
-    last = len(knots) - 1
-    k = min(max(int(t * last), 0), max(last - 1, 0))
-    u = t * last - k
-    for d in range(3):
-        out[d] = knots[0, d] if last == 0 else (1 - u) * knots[k, d] + u * knots[k + 1, d]
-
-
-@inlined
-def _restrict(c, start, end):
-    """Turn Bernstein coefficients (n,) into those on [start, end]."""
-    n = len(c)
-    for m in range(n - 1, 0, -1):  # the part before `end`
-        for i in range(n - 1, n - 1 - m, -1):
-            c[i] = (1 - end) * c[i - 1] + end * c[i]
-    share = start / end
-    for m in range(n - 1, 0, -1):  # and of it the part after `start`
-        for i in range(m):
-            c[i] = (1 - share) * c[i] + share * c[i + 1]
-
-
-@inlined
-def _cross_linear(a0, a1, b0, b1, out):
-    """Write the coefficients (3, 3) of the cross product of linear vectors to `out`."""
-    for d in range(3):
-        i, j = FIRST[d], SECOND[d]
-        out[0, d] = a0[i] * b0[j] - a0[j] * b0[i]
-        out[1, d] = 0.5 * ((a0[i] * b1[j] - a0[j] * b1[i]) + (a1[i] * b0[j] - a1[j] * b0[i]))
-        out[2, d] = a1[i] * b1[j] - a1[j] * b1[i]
-
-
-@inlined
-def _add_dot_2_3(a, b, sign, out):
-    """Add the dot products of vectors of degree 2, (3, 3), and 3, (4, 3), to `out` (6,), `sign` times."""
-    for i in range(3):
-        for j in range(4):
-            dot = a[i, 0] * b[j, 0] + a[i, 1] * b[j, 1] + a[i, 2] * b[j, 2]
-            out[i + j] += sign * FIVE_OF_2_3[i, i + j] * dot
-
-
-@inlined
-def _add_2_3(a, b, sign, out):
-    """Add the product of polynomials of degree 2, (3,), and 3, (4,), to `out` (6,), `sign` times."""
-    for i in range(3):
-        for j in range(4):
-            out[i + j] += sign * FIVE_OF_2_3[i, i + j] * a[i] * b[j]
-
-
-@inlined
-def _dot_2_1(a, b0, b1, out):
-    """Write the dot product of vectors of degree 2, (3, 3), and 1 to `out` (4,)."""
-    out[:] = 0.0
-    for i in range(3):
-        first = a[i, 0] * b0[0] + a[i, 1] * b0[1] + a[i, 2] * b0[2]
-        last = a[i, 0] * b1[0] + a[i, 1] * b1[1] + a[i, 2] * b1[2]
-        out[i] += first * (3 - i) / 3
-        out[i + 1] += last * (i + 1) / 3
-
-
-@jit
-def _largest(values):
-    """Return the greatest absolute value of an array of any shape."""
-    out = 0.0
-    for v in values.flat:
-        out = max(out, abs(v))
-    return out
-
-
-@jit
-def _from_position(corner, lamp, point, scratch, out):
-    """Write the polynomials of a lamp at a place, and their rounding, to `out`; return how many, 0 if excluded."""
-    p, s, gap = point
-    normal, vector, _, rest = scratch
-    signs, room = out
-    scale, away = (s[0] + s[1] + s[2]) / 3, 0.0
-    for d in range(3):
-        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
-    away = gap * max(_largest(corner), away / scale)
-    reach = _largest(p) + max(s[0], s[1], s[2]) * _largest(lamp)
-    square = 0.0
-    for d in range(3):
-        vector[0, d] = p[0, d] - s[0] * lamp[0, d]
-        vector[1, d] = p[1, d] - (s[0] * lamp[1, d] + 2 * s[1] * lamp[0, d]) / 3
-        vector[2, d] = p[2, d] - (2 * s[1] * lamp[1, d] + s[2] * lamp[0, d]) / 3
-        vector[3, d] = p[3, d] - s[2] * lamp[1, d]
-        square += ((vector[0, d] + vector[1, d] + vector[2, d] + vector[3, d]) / 4) ** 2
-        for i in range(3):
-            corner[0, i, d] -= lamp[0, d]
-            corner[1, i, d] -= lamp[1, d]
-    size0, size1, size2 = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
-    sizes = size0 * size1, size1 * size2, size2 * size0
-    signs[:] = 0.0
-    volume = rest[0, 0]
-    for e in range(3):
-        i, j = e, FIRST[e]
-        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
-        _add_dot_2_3(normal, vector, 1.0, signs[e])
-        if e == 1:
-            _dot_2_1(normal, corner[0, 0], corner[1, 0], volume)
-        room[e] = ROOM * NOISE * reach * sizes[e]
-        if e > 0 and _is_excluded(signs, room, e + 1):
-            return 0
-    distance = np.sqrt(square) / scale
-    bias = min(away / distance, 1.0) if distance > 0 else 1.0
-    for k in range(6):
-        signs[4, k] = (1 - bias) * (signs[0, k] + signs[1, k] + signs[2, k])
-    _add_2_3(s, volume, -1.0, signs[4])
-    signs[3, 0], signs[3, 5] = volume[0], volume[3]  # degree 3 as degree 5
-    signs[3, 1] = 0.4 * volume[0] + 0.6 * volume[1]
-    signs[3, 2] = 0.1 * volume[0] + 0.6 * volume[1] + 0.3 * volume[2]
-    signs[3, 3] = 0.3 * volume[1] + 0.6 * volume[2] + 0.1 * volume[3]
-    signs[3, 4] = 0.6 * volume[2] + 0.4 * volume[3]
-    room[3] = ROOM * NOISE * size0 * size1 * size2
-    room[4] = room[0] + room[1] + room[2] + max(s[0], s[1], s[2]) * room[3]
-    return 5
-
-
-@jit
-def _along_direction(corner, way, point, scratch, out):
-    """Write the polynomials of a direction, and their rounding, to `out`; return how many, 0 if excluded."""
-    p, s, gap = point
-    normal, vector, side, rest = scratch
-    signs, room = out
-    scale, away, square, span = (s[0] + s[1] + s[2]) / 3, 0.0, 0.0, 0.0
-    for d in range(3):
-        away = max(away, abs(p[0, d] + p[1, d] + p[2, d] + p[3, d]) / 4)
-        square += (0.5 * (way[0, d] + way[1, d])) ** 2
-    away = gap * max(_largest(corner), away / scale)
-    reach, speed, largest = _largest(p), _largest(way), max(s[0], s[1], s[2])
-    size = _largest(corner[:, 0]), _largest(corner[:, 1]), _largest(corner[:, 2])
-    signs[:] = 0.0
-    constant = rest[0, 0]
-    for e in range(3):
-        i, j = e, FIRST[e]
-        for a in range(2):
-            for d in range(3):
-                side[a, d] = corner[a, j, d] - corner[a, i, d]
-                span = max(span, abs(side[a, d]))
-        _cross_linear(way[0], way[1], side[0], side[1], normal)
-        _add_dot_2_3(normal, p, 1.0, signs[e])
-        _cross_linear(corner[0, i], corner[1, i], corner[0, j], corner[1, j], normal)
-        _dot_2_1(normal, way[0], way[1], constant)
-        _add_2_3(s, constant, 1.0, signs[e])
-        room[e] = ROOM * NOISE * speed * (reach * (size[i] + size[j]) + largest * size[i] * size[j])
-        if e > 0 and _is_excluded(signs, room, e + 1):
-            return 0
-    first, second = rest[1], rest[2]
-    for d in range(3):
-        for a in range(2):
-            first[a, d], second[a, d] = corner[a, 1, d] - corner[a, 0, d], corner[a, 2, d] - corner[a, 0, d]
-        vector[0, d] = p[0, d] - s[0] * corner[0, 0, d]
-        vector[1, d] = p[1, d] - (s[0] * corner[1, 0, d] + 2 * s[1] * corner[0, 0, d]) / 3
-        vector[2, d] = p[2, d] - (2 * s[1] * corner[1, 0, d] + s[2] * corner[0, 0, d]) / 3
-        vector[3, d] = p[3, d] - s[2] * corner[1, 0, d]
-    _cross_linear(first[0], first[1], second[0], second[1], normal)
-    _add_dot_2_3(normal, vector, 1.0, signs[3])
-    _dot_2_1(normal, way[0], way[1], constant)
-    length = np.sqrt(square)
-    _add_2_3(s, constant, -away / (length if length > 0 else 1.0), signs[3])
-    room[3] = ROOM * NOISE * span * span * (reach + largest * size[0])
-    return 4
-
-
-@inlined
-def _is_excluded(signs, room, n_signs):
-    """Return whether the first coefficients `signs` (5, 6) show that no time has one sign, to `room` (5,)."""
-    can_be_up, can_be_down = True, True
-    for q in range(n_signs):
-        low, high = signs[q, 0], signs[q, 0]
-        for k in range(1, 6):
-            low, high = min(low, signs[q, k]), max(high, signs[q, k])
-        can_be_up &= high >= -room[q]
-        can_be_down &= low <= room[q]
-    return not (can_be_up or can_be_down)
-
-
-@jit
-def _may_be_alike(signs, room, n_signs, n_halvings):
-    """Return whether coefficients `signs` (halvings + 1, 5, 6), of which the first are given, may have one sign at some
-    time, to `room` (5,).
+def may_be_alike(signs, noise, n_signs, n):
+    """Return whether `n` coefficients each of `signs` (halvings + 1, 5, 6), of which the first are given, may have one
+    sign at some time, to `noise` (5,).
     """
     halves, depth = 0, 0  # bit l: the second half of level l is looked at
     while True:
@@ -262,18 +25,19 @@ def _may_be_alike(signs, room, n_signs, n_halvings):
         surely_up, surely_down = True, True
         for q in range(n_signs):
             low, high = signs[depth, q, 0], signs[depth, q, 0]
-            for k in range(1, 6):
+            for k in range(1, n):
                 low, high = min(low, signs[depth, q, k]), max(high, signs[depth, q, k])
-            can_be_up &= high >= -room[q]
-            can_be_down &= low <= room[q]
-            surely_up &= low > room[q]
-            surely_down &= high < -room[q]
+            least = -noise[q] if q < N_EDGES else noise[q]
+            can_be_up &= high >= least
+            can_be_down &= low <= -least
+            surely_up &= low > noise[q]
+            surely_down &= high < -noise[q]
         if surely_up or surely_down:
             return True
         if can_be_up or can_be_down:
-            if depth == n_halvings:
+            if depth == HALVINGS:
                 return True
-            _halve(signs, depth, n_signs)
+            _halve(signs, depth, n_signs, n)
             depth += 1
             halves &= ~(1 << depth)
             continue
@@ -282,26 +46,26 @@ def _may_be_alike(signs, room, n_signs, n_halvings):
         if depth == 0:
             return False
         halves |= 1 << depth
-        _second_half(signs, depth, n_signs)
+        _second_half(signs, depth, n_signs, n)
 
 
 @jit
-def _halve(signs, depth, n_signs):
+def _halve(signs, depth, n_signs, n):
     """Write the coefficients on the first half of level `depth` to the next."""
     for q in range(n_signs):
-        for k in range(6):
+        for k in range(n):
             signs[depth + 1, q, k] = signs[depth, q, k]
-        for m in range(5):
-            for k in range(5, m, -1):
+        for m in range(n - 1):
+            for k in range(n - 1, m, -1):
                 signs[depth + 1, q, k] = 0.5 * (signs[depth + 1, q, k - 1] + signs[depth + 1, q, k])
 
 
 @jit
-def _second_half(signs, depth, n_signs):
+def _second_half(signs, depth, n_signs, n):
     """Write the coefficients on the second half of the level before `depth` to it."""
     for q in range(n_signs):
-        for k in range(6):
+        for k in range(n):
             signs[depth, q, k] = signs[depth - 1, q, k]
-        for m in range(5, 0, -1):
+        for m in range(n - 1, 0, -1):
             for k in range(m):
                 signs[depth, q, k] = 0.5 * (signs[depth, q, k] + signs[depth, q, k + 1])

@@ -6,7 +6,6 @@ Source: Ronnow et al. 2021 (pipeline); blocks under a memory budget: ours.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
@@ -62,8 +61,11 @@ class Exposure:
     def image(self, ray: Ray) -> Tensor:
         """Return (shutters, H, W, N_LOOKS + M) float64: looks and coverage for one ray per pixel. Source: see above."""
         camera, device = self.scene.camera, self.scene.device
-        if self.backend == "cpu" and self._way().method == "exact" and self.work.prisms.surfaces.casters is None:
-            return self._composite(ray) if self._is_plain() else self._integrate(ray)
+        if self.backend == "cpu" and self._way().method == "exact":
+            if self._is_plain():
+                return self._composite(ray)
+            if not self._has_open_casters():
+                return self._integrate(ray)
         places, values = [], []
         for (column, row), intervals, cells in self._seen(ray):
             places.append(row * camera.width + column)
@@ -78,6 +80,12 @@ class Exposure:
         """Return whether colours are constant, so that cells need no further look."""
         surfaces = self.work.prisms.surfaces
         return not ((surfaces.is_textured | surfaces.is_lit).any() or self._is_forced("curvature"))
+
+    def _has_open_casters(self) -> bool:
+        """Return whether textures decide how much light casters let through."""
+        surfaces = self.work.prisms.surfaces
+        casters = surfaces.casters
+        return casters is not None and bool(surfaces.has_varying_opacity[casters.face].any())
 
     def _is_forced(self, name: str) -> bool:
         return self.work.plan[name].forced
@@ -100,17 +108,11 @@ class Exposure:
         return image
 
     def _integrate(self, ray: Ray) -> Tensor:
-        """Return what `image` does, where looks may vary and nothing casts shadows."""
+        """Return what `image` does, where looks may vary."""
         may_cross = "crossings" in self.work.plan.simulated
         with self.ledger.stage("intervals", self.scene.device):
-            steps = visibility.integrate(self._sight(), self.scene, ray, may_cross, self.memory_bytes)
-        names = itertools.cycle(("intervals", "resolve"))
-        while True:
-            with self.ledger.stage(next(names), self.scene.device):
-                image, counts = next(steps)
-            self.ledger.add_many(counts)
-            if image is not None:
-                return image
+            sight = self._sight()
+        return visibility.integrate(sight, self.scene, ray, may_cross, (self.memory_bytes, self.ledger))
 
     def _seen(self, ray: Ray) -> Iterator[tuple[tuple[Tensor, Tensor], Intervals, Cells | None]]:
         """Yield column and row of some pixels, the intervals of these, and their cells where they are cut already."""

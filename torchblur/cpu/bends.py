@@ -1,6 +1,6 @@
 """When the looks of a span bend, one ray at a time: what texture_bends.py and light_bends.py say, compiled.
 
-Before: curves.py, polynomials.py.  After: expose.py.
+Before: receive.py, polynomials.py.  After: expose.py.
 Symbols as in curves.py.
 Source: ours.
 """
@@ -17,6 +17,7 @@ from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import SPOT, Lit
 from torchblur.cpu.layers import Looks
 from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
+from torchblur.cpu.receive import Shade
 from torchblur.light_bends import FLAT
 from torchblur.light_bends import NOISE as LIGHT_NOISE
 from torchblur.texture_bends import NOISE as TEXTURE_NOISE
@@ -40,17 +41,24 @@ def make_bends(n: int) -> Bends:
 
 
 @inlined
-def find_bends(span: Span, n_layers: int, looks: Looks, lit: Lit, bends: Bends) -> int:
-    """Write the times inside a span at which its varying looks may bend, and its ends, in ascending order.
+def find_bends(span: Span, n_layers: int, scene: tuple[Looks, Lit], shade: Shade, bends: Bends) -> int:
+    """Write the times inside a span at which its varying looks may bend or shadows begin or end, and its ends, in
+    ascending order.
 
     Returns:
         How many there are, or minus how many there would be where there is no room for them.
     """
+    looks, lit = scene
     tau = bends.tau
     tau[0], tau[1] = 0.0, 1.0
     count = 2
     for m in range(n_layers):
         flags = span.flags[m]
+        if flags & LIT and shade.n_receivers > 0:
+            for lamp in range(len(lit.kind)):
+                for r in range(shade.first[lamp, span.receiver[m]], shade.first[lamp, span.receiver[m] + 1]):
+                    count = _add(tau, count, shade.start[r])
+                    count = _add(tau, count, shade.end[r])
         if not flags & VARYING:
             continue
         if flags & TEXTURED:

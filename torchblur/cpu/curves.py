@@ -18,7 +18,7 @@ from torchblur.cpu.lambert import DIRECTIONAL, SPOT, Lit, along
 from torchblur.cpu.layers import Looks
 from torchblur.prisms import Prisms
 
-TEXTURED, MIPPED, LIT, NEAR, VARYING, MULTIPLIES = 1, 2, 4, 8, 16, 32  # flags of a layer
+TEXTURED, MIPPED, LIT, NEAR, VARYING, MULTIPLIES, RESTS = 1, 2, 4, 8, 16, 32, 64  # flags of a layer
 CORNER, EDGE, ACROSS, SQUARE, CONE = 0, 2, 5, 8, 10  # rows of the room
 
 
@@ -32,7 +32,7 @@ class Stock(NamedTuple):
     parity: np.ndarray  # (P,)
     world: np.ndarray  # (P, 2, 3, 3), or none
     normal: np.ndarray  # (P, 2, 3, 3), or none
-    flags: np.ndarray  # (F,) int64 of TEXTURED, LIT, VARYING, MULTIPLIES
+    flags: np.ndarray  # (F,) int64 of TEXTURED, LIT, VARYING, MULTIPLIES, RESTS
     is_smooth: np.ndarray  # (F,) bool: has normals
 
 
@@ -46,6 +46,8 @@ class Span(NamedTuple):
     corners: np.ndarray  # (L, 2, 2) least and greatest u and v of the corners
     slope: np.ndarray  # (L, 5, 4) rows of the footprint's matrix, last, in texels of level 0
     level: np.ndarray  # (L, 2) int64 least and greatest level of lookups
+    receiver: np.ndarray  # (L,) int64 number of the layer among those that light falls on
+    place: np.ndarray  # (L, 3, 4) P
     normal: np.ndarray  # (L, 3, 4)
     side: np.ndarray  # (L, 2) what makes N V the cosine: of lamps that are near, and of directions
     vector: np.ndarray  # (L, lamps, 3, 4)
@@ -58,7 +60,8 @@ def find_stock(prisms: Prisms) -> Stock:
     """Return what the compiled code needs of the prisms. Source: ours."""
     surfaces = prisms.surfaces
     marks = (TEXTURED, surfaces.is_textured), (LIT, surfaces.is_lit), (VARYING, surfaces.is_varying)
-    flags = sum(flag * is_so.long() for flag, is_so in (*marks, (MULTIPLIES, surfaces.has_varying_opacity)))
+    more = (MULTIPLIES, surfaces.has_varying_opacity), (RESTS, surfaces.rests)
+    flags = sum(flag * is_so.long() for flag, is_so in (*marks, *more))
     world, normal = (moving.permute(3, 0, 1, 2) for moving in (prisms.world, prisms.normal))
     tensors = (
         prisms.clip.permute(3, 0, 1, 2)[..., [0, 1, 3]],
@@ -88,6 +91,8 @@ def make_span(n_layers: int, n_lamps: int) -> Span:
         np.empty((n, 2, 2)),
         np.empty((n, 5, 4)),
         np.zeros((n, 2), ints),
+        np.zeros(n, ints),
+        np.empty((n, 3, 4)),
         np.zeros((n, 3, 4)),
         np.empty((n, 2)),
         np.zeros((n, n_lamps, 3, 4)),
@@ -109,7 +114,9 @@ def follow(stock: Stock, looks: Looks, lit: Lit, span: Span, what: tuple[int, in
     m, prism, x_ndc, y_ndc, t_start, t_end = what
     face = stock.face[prism]
     flags = stock.flags[face]
-    span.face[m], span.flags[m] = face, flags & ~(MIPPED | NEAR)
+    if flags & RESTS:  # only the shadows on it change, which are known
+        flags &= ~VARYING
+    span.face[m], span.flags[m] = face, flags
     if not flags & (TEXTURED | LIT):
         return
     corner, e = span.room[CORNER:EDGE], span.room[EDGE:ACROSS]
@@ -249,7 +256,7 @@ def _follow_light(
 ) -> None:
     """Write the normal and the vectors to the lamps; `layer` is its place, prism, and times in the prism."""
     m, prism, at = layer
-    e, place, ends = span.room[EDGE:ACROSS], span.room[ACROSS:SQUARE], span.room[CORNER:EDGE]
+    e, place, ends = span.room[EDGE:ACROSS], span.place[m], span.room[CORNER:EDGE]
     normal, scale = span.normal, span.scale
     sign = np.sign(scale[m, 0] + scale[m, 1] + scale[m, 2])
     parity, is_smooth = stock.parity[prism], stock.is_smooth[stock.face[prism]]

@@ -1,9 +1,9 @@
-"""Integrate listed cells whose looks may vary over the exposure: nodes.py and resolve.py, one ray at a time.
+"""Look at listed cells whose looks may vary, one ray at a time: what light falls on in them, and what they show.
 
-Before: blend.py, bends.py, panels.py, shine.py.  After: visibility.py.
-Symbols: S shutters; a cell in which nothing varies is looked at once, in its middle; else its spans are cut where looks
-bend, and the panels between get as many of Gauss's nodes as panels.py asks for.
-Source: Ronnow et al. 2021, alg. 1 (resolve); Gauss-Legendre quadrature; ours.
+Before: blend.py, quadrature.py.  After: visibility.py.
+Symbols: S shutters, C channels; a span is a slice of a cell in which neither the shutter nor a light has a knot; a cell
+in which nothing varies is one.
+Source: ours.
 """
 
 from __future__ import annotations
@@ -12,23 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from torchblur.cpu.bends import Bends, find_bends, make_bends
-from torchblur.cpu.blend import DOWN, N_LOOKS, RIGHT, UP, Colours, Listed, integral
-from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, TEXTURED, VARYING, Span, Stock, follow, make_span
+from torchblur.cpu.bends import find_bends, make_bends
+from torchblur.cpu.blend import DOWN, N_LOOKS, RIGHT, UP, Colours, Listed
+from torchblur.cpu.curves import LIT, VARYING, Stock, follow, make_span
 from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.lambert import Lit
 from torchblur.cpu.layers import Looks
-from torchblur.cpu.panels import Panel, count_nodes, expand, make_panel
-from torchblur.cpu.shine import level_at, look_at, place_at
+from torchblur.cpu.panels import make_panel
+from torchblur.cpu.quadrature import DELAY, Room, add_flat, add_varying, make_room
+from torchblur.cpu.receive import Received, Shade, make_received, receive, with_room
 from torchblur.cpu.tiles import View
-from torchblur.nodes import COUNTS, FREE_HALVINGS, MANY, MAX_HALVINGS
 from torchblur.sort import SAME_TIME
 
-NODE, SHARE = np.zeros((2, COUNTS[-1] + 1, COUNTS[-1]))  # on [-1, 1], and weights that add up to 1
-for _n in range(1, COUNTS[-1] + 1):
-    NODE[_n, :_n], SHARE[_n, :_n] = np.polynomial.legendre.leggauss(_n)
-SHARE *= 0.5
-DELAY, AREA, BEFORE, WEIGHT, LEVEL, RISE, N_ROWS = 0, 1, 2, 3, 4, 5, 6  # of what is kept of each shutter
+FIRST_ROOM = 256
 
 
 class Scene(NamedTuple):
@@ -42,38 +38,37 @@ class Scene(NamedTuple):
     rays: View
 
 
-class Room(NamedTuple):
-    """What the rays of a thread work in."""
-
-    shutter: np.ndarray  # (N_ROWS, S): delay of the line, area of the weights, their integral before, weight of a
-    #                      sample; and over a span the weight at its start and the rise to its end
-    ends: np.ndarray  # (most spans + 1,) shares of the cell at which its spans end
-    stack: np.ndarray  # (MAX_HALVINGS + 2, 3) panels yet to be done: start, end, halvings
-    moment: np.ndarray  # (2, S, 4) integrals of 1, x, y, x y over a panel, for the finer and the coarser level
-    corner: np.ndarray  # (2, 2) first column and row of the texels looked up, by level
-    seen: np.ndarray  # (M,) int64 sample in which a mesh was seen last
-    count: np.ndarray  # (3,) int64 samples, panels halved often in this span, and the last panel's ellipse
-
-
 @jit
-def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
-    """Add what listed cells show to an image (H, W, S, C), and return how many samples that took. Source: ours."""
+def expose(
+    listed: Listed, scene: Scene, shades: tuple[Shade, Shade], begin: tuple[int, int, bool], image: np.ndarray
+) -> tuple[int, Received, Received]:
+    """Look at listed cells: collect what light falls on, or add what they show to an image (H, W, S, C).
+
+    Args:
+        listed: cells.
+        scene: of them.
+        shades: when light is blocked on receivers over spans, and on those at instants.
+        begin: numbers of the first receivers of both kinds, and whether to collect them and no more.
+        image: to add to.
+
+    Returns:
+        The number of samples, and the receivers over spans and at instants.
+
+    Source: ours.
+    """
     listed, image = borrowed(listed), borrowed(image)
     stock, looks, colours, view = borrowed(scene.stock), borrowed(scene.looks), borrowed(scene.colours), scene.rays
-    knots, lit = borrowed(scene.knots), borrowed(scene.lit)
-    n_lamps, n_shutters = len(lit.kind), len(colours.delay)
-    span, panel, bends = make_span(8, n_lamps), make_panel(8, n_lamps), make_bends(256)
-    room = Room(
-        np.zeros((N_ROWS, n_shutters)),
-        np.empty(len(colours.time) + len(knots) + 2),
-        np.empty((MAX_HALVINGS + 2, 3)),
-        np.empty((2, n_shutters, 4)),
-        np.empty((2, 2)),
-        np.zeros(max(1, image.shape[3] - N_LOOKS), np.int64),
-        np.zeros(3, np.int64),
+    knots, lit, shade, still_shade = (
+        borrowed(scene.knots),
+        borrowed(scene.lit),
+        borrowed(shades[0]),
+        borrowed(shades[1]),
     )
-    for s in range(n_shutters):
-        room.shutter[AREA, s] = integral(colours, s, colours.time[colours.first[s + 1] - 1])
+    n_lamps, n_shutters = len(lit.kind), len(colours.delay)
+    number, still_number, is_collecting = begin
+    moving, resting = make_received(FIRST_ROOM, n_lamps), make_received(FIRST_ROOM, n_lamps)
+    span, panel, bends = make_span(8, n_lamps), make_panel(8, n_lamps), make_bends(FIRST_ROOM)
+    room = make_room(colours, len(knots), image.shape[3] - N_LOOKS)
     interval, cell, layer = 0, 0, 0
     for p in range(listed.size[0]):
         pixel, n_intervals, n_cells = listed.pixel[p, 0], listed.pixel[p, 1], listed.pixel[p, 2]
@@ -95,9 +90,7 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
             for m in range(n_layers):
                 prism = listed.prism[interval + listed.layer[layer + m]]
                 varies |= stock.flags[stock.face[prism]] & VARYING != 0
-            n_spans = 1
-            if varies:
-                n_spans = _cut(colours, knots, (t_start, t_end), borrowed(room))
+            n_spans = _cut(colours, knots, (t_start, t_end), borrowed(room)) if varies else 1
             for part in range(n_spans):
                 start, end = t_start, t_end
                 if n_spans > 1:
@@ -108,19 +101,31 @@ def expose(listed: Listed, scene: Scene, image: np.ndarray) -> int:
                 for m in range(n_layers):
                     prism = listed.prism[interval + listed.layer[layer + m]]
                     follow(stock, looks, lit, borrowed(span), (m, prism, x_ndc, y_ndc, start, end))
+                    if not span.flags[m] & LIT:
+                        continue
+                    span.receiver[m] = number if varies else still_number
+                    number, still_number = number + varies, still_number + (not varies)
+                    if is_collecting and varies:
+                        moving = with_room(moving)
+                        receive(borrowed(span), m, lit, (start, end), borrowed(moving))
+                    elif is_collecting:
+                        resting, middle = with_room(resting), 0.5 * (start + end)
+                        receive(borrowed(span), m, lit, (middle, middle), borrowed(resting))
+                if is_collecting:
+                    continue
                 out = image[row, column]
                 what, when = borrowed((span, panel)), (start, end, borrowed(room))
                 if not varies:
-                    _add_flat(what, n_layers, (looks, lit, colours), when, out)
+                    add_flat(what, n_layers, (looks, lit, still_shade, colours), when, out)
                     continue
-                n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
+                n = find_bends(borrowed(span), n_layers, (looks, lit), shade, borrowed(bends))
                 if n < 0:
                     bends = make_bends(-2 * n)
-                    n = find_bends(borrowed(span), n_layers, looks, lit, borrowed(bends))
-                _add_varying(what, (n_layers, n, borrowed(bends)), (looks, lit, colours), when, out)
+                    n = find_bends(borrowed(span), n_layers, (looks, lit), shade, borrowed(bends))
+                add_varying(what, (n_layers, n, borrowed(bends)), (looks, lit, shade, colours), when, out)
             layer += n_layers
         interval, cell = interval + n_intervals, cell + n_cells
-    return room.count[0]
+    return room.count[0], moving, resting
 
 
 @inlined
@@ -150,196 +155,3 @@ def _put(ends: np.ndarray, n: int, share: float) -> int:
         place -= 1
     ends[place] = share
     return n + 1
-
-
-@inlined
-def _add_flat(
-    what: tuple[Span, Panel],
-    n_layers: int,
-    scene: tuple[Looks, Lit, Colours],
-    when: tuple[float, float, Room],
-    out: np.ndarray,
-) -> None:
-    """Add what a cell shows in which nothing varies."""
-    looks, lit, colours = scene
-    start, end, room = when
-    shutter = room.shutter
-    for s in range(len(colours.delay)):
-        delay = shutter[DELAY, s]
-        whole = integral(colours, s, end - delay) - integral(colours, s, start - delay)
-        shutter[WEIGHT, s] = whole / shutter[AREA, s]
-    expand(what[0], n_layers, lit, (0.5, 0.5), what[1])
-    _add_sample(what, n_layers, (looks, lit, colours.cutoff), (0.0, room), out)
-
-
-@inlined
-def _add_sample(
-    what: tuple[Span, Panel], n_layers: int, scene: tuple[Looks, Lit, float], when: tuple[float, Room], out: np.ndarray
-) -> None:
-    """Add what is seen at a time of a panel, front to back, by the shutters' weights."""
-    looks, lit, cutoff = scene
-    time, room = when
-    weight, seen = room.shutter[WEIGHT], room.seen
-    room.count[0] += 1
-    stamp = room.count[0]
-    red, green, blue, direct, left = 0.0, 0.0, 0.0, 0.0, 1.0
-    for m in range(n_layers):
-        r, g, b, alpha, light = look_at(what[0], what[1], m, (looks, lit), time)
-        part = left * alpha
-        red, green, blue, direct = red + part * r, green + part * g, blue + part * b, direct + part * light
-        mesh = looks.mesh_of[what[0].face[m]]
-        if alpha > 0 and seen[mesh] != stamp:
-            seen[mesh] = stamp
-            for s in range(len(out)):
-                out[s, N_LOOKS + mesh] += weight[s]
-        left *= 1 - alpha
-        if not left > cutoff:
-            break
-    for s in range(len(out)):
-        share = weight[s]
-        out[s, 0] += share * red
-        out[s, 1] += share * green
-        out[s, 2] += share * blue
-        out[s, 3] += share * (1 - left)
-        out[s, 4] += share * direct
-        out[s, 5] += share * direct
-
-
-@inlined
-def _weigh_span(colours: Colours, when: tuple[float, float, Room]) -> bool:
-    """Write the shutters' weights at a span's start, and their rise to its end; return whether all are constant."""
-    start, end, room = when
-    middle, is_even = 0.5 * (start + end), True
-    for s in range(len(colours.delay)):
-        delay = room.shutter[DELAY, s]
-        room.shutter[LEVEL, s] = room.shutter[RISE, s] = 0.0
-        for k in range(colours.first[s], colours.first[s + 1] - 1):
-            t0, t1 = colours.time[k], colours.time[k + 1]
-            if not (t0 <= middle - delay <= t1):
-                continue
-            w0, rise = colours.weight[k], colours.weight[k + 1] - colours.weight[k]
-            slope = rise / (t1 - t0) / room.shutter[AREA, s]
-            room.shutter[LEVEL, s] = w0 / room.shutter[AREA, s] + (start - delay - t0) * slope
-            room.shutter[RISE, s] = (end - start) * slope
-            is_even &= rise == 0
-            break
-    return is_even
-
-
-@inlined
-def _add_varying(
-    what: tuple[Span, Panel],
-    seen: tuple[int, int, Bends],
-    scene: tuple[Looks, Lit, Colours],
-    when: tuple[float, float, Room],
-    out: np.ndarray,
-) -> None:
-    """Add what a span shows whose looks vary; `seen` is how many layers, how many bends, and these."""
-    n_layers, n_bends, bends = seen
-    (span, panel), (looks, lit, colours), (start, end, room) = what, scene, when
-    tau, stack, shutter = bends.tau, room.stack, room.shutter
-    is_even = _weigh_span(colours, when)
-    is_simple = n_layers == 1 and span.flags[0] & (TEXTURED | LIT | MULTIPLIES) == TEXTURED
-    is_simple &= looks.opacity[span.face[0]] == 1
-    room.count[1] = 0
-    for k in range(n_bends - 1):
-        if not tau[k + 1] - tau[k] > SAME_TIME:
-            continue
-        stack[0, 0], stack[0, 1], stack[0, 2] = tau[k], tau[k + 1], 0.0
-        top = 1
-        while top > 0:
-            top -= 1
-            a, b, halvings = stack[top, 0], stack[top, 1], stack[top, 2]
-            middle, half = 0.5 * (a + b), 0.5 * (b - a)
-            expand(span, n_layers, lit, (middle, half), panel)
-            n, room.count[2] = count_nodes(span, n_layers, (looks, lit), panel, (is_even, room.count[2]))
-            if n == 0:
-                if halvings >= FREE_HALVINGS:
-                    room.count[1] += 1
-                if halvings < MAX_HALVINGS and room.count[1] <= MANY:
-                    stack[top, 0], stack[top, 1], stack[top, 2] = middle, b, halvings + 1
-                    stack[top + 1, 0], stack[top + 1, 1], stack[top + 1, 2] = a, middle, halvings + 1
-                    top += 2
-                    continue
-                n = COUNTS[-1]
-            part = (middle, half, 2 * half * (end - start))
-            if is_simple:
-                _add_panel(what, looks, (n, part), room, out)
-                continue
-            for j in range(n):
-                for s in range(len(out)):
-                    level = shutter[LEVEL, s] + (middle + half * NODE[n, j]) * shutter[RISE, s]
-                    shutter[WEIGHT, s] = part[2] * SHARE[n, j] * level
-                _add_sample(what, n_layers, (looks, lit, colours.cutoff), (NODE[n, j], room), out)
-
-
-@inlined
-def _add_panel(
-    what: tuple[Span, Panel],
-    looks: Looks,
-    nodes: tuple[int, tuple[float, float, float]],
-    room: Room,
-    out: np.ndarray,
-) -> None:
-    """Add what a panel shows of an opaque layer that is textured and no more: its texels are the same throughout, and
-    weigh by the moments of the place between them. `nodes` is their number, and middle, half and length of the panel.
-    """
-    span, panel = what
-    n, (middle, half, length) = nodes
-    face, fine, moment, shutter = span.face[0], span.level[0, 0], room.moment, room.shutter
-    mesh = looks.mesh_of[face]
-    last, n_levels = looks.n_levels[mesh] - 1, 1
-    if span.flags[0] & MIPPED:
-        fine = int(level_at(panel, 0, last, 0.0))
-        n_levels = 2 if fine < last else 1
-    u, v = place_at(panel, 0, 0.0)
-    for k in range(n_levels):
-        width, height = looks.size[fine + k, 0, mesh], looks.size[fine + k, 1, mesh]
-        room.corner[k, 0], room.corner[k, 1] = np.floor(u * width - 0.5), np.floor((1 - v) * height - 0.5)
-        for s in range(len(out)):
-            for c in range(4):
-                moment[k, s, c] = 0.0
-    for j in range(n):
-        node = NODE[n, j]
-        u, v = place_at(panel, 0, node)
-        coarse = level_at(panel, 0, last, node) - fine if n_levels == 2 else 0.0
-        for k in range(n_levels):
-            x = u * looks.size[fine + k, 0, mesh] - 0.5 - room.corner[k, 0]
-            y = (1 - v) * looks.size[fine + k, 1, mesh] - 0.5 - room.corner[k, 1]
-            share = length * SHARE[n, j] * (coarse if k else 1 - coarse)
-            for s in range(len(out)):
-                weight = share * (shutter[LEVEL, s] + (middle + half * node) * shutter[RISE, s])
-                moment[k, s, 0] += weight
-                moment[k, s, 1] += weight * x
-                moment[k, s, 2] += weight * y
-                moment[k, s, 3] += weight * x * y
-    room.count[0] += n
-    for k in range(n_levels):
-        _add_texels(looks, (face, mesh, fine + k), (room.corner[k, 0], room.corner[k, 1]), moment[k], out)
-
-
-@inlined
-def _add_texels(
-    looks: Looks, which: tuple[int, int, int], corner: tuple[float, float], moment: np.ndarray, out: np.ndarray
-) -> None:
-    """Add the four texels about a `corner` of the texture of a face, mesh and level, by moments (S, 4)."""
-    face, mesh, level = which
-    width, height = looks.size[level, 0, mesh], looks.size[level, 1, mesh]
-    column, row = int(corner[0]), int(corner[1])
-    if looks.repeats[mesh]:
-        column0, row0, column1, row1 = column % width, row % height, (column + 1) % width, (row + 1) % height
-    else:
-        column0, row0 = min(max(column, 0), width - 1), min(max(row, 0), height - 1)
-        column1, row1 = min(max(column + 1, 0), width - 1), min(max(row + 1, 0), height - 1)
-    first, texels = looks.first[level, mesh], looks.texels
-    i, j = first + row0 * width + column0, first + row0 * width + column1
-    k, m = first + row1 * width + column0, first + row1 * width + column1
-    for s in range(len(out)):
-        xy = moment[s, 3]
-        right, below = moment[s, 1] - xy, moment[s, 2] - xy
-        rest = moment[s, 0] - moment[s, 1] - below
-        for c in range(3):
-            total = rest * texels[i, c] + right * texels[j, c] + below * texels[k, c] + xy * texels[m, c]
-            out[s, c] += looks.rgb[face, c] * total
-        out[s, 3] += moment[s, 0]
-        out[s, N_LOOKS + mesh] += moment[s, 0]

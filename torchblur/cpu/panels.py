@@ -1,6 +1,6 @@
 """How many of Gauss's nodes a slice of a span needs, certified: what certificate.py says, compiled.
 
-Before: curves.py.  After: shine.py, expose.py.
+Before: receive.py.  After: shine.py, expose.py.
 Symbols: a panel is a slice of a span in which no look bends; s in [-1, 1] is time in it; there curves are kept by their
 powers of s. Rest as in certificate.py and curves.py. Where no light and no mip level varies their growth is left out of
 the bound, and that of the shutter where it is constant.
@@ -18,6 +18,7 @@ from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, NEAR, TEXTURED, VARYIN
 from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import SPOT, Lit
 from torchblur.cpu.layers import Looks
+from torchblur.cpu.receive import Shade, visible_at
 from torchblur.light_bends import LINEAR
 from torchblur.nodes import COUNTS
 
@@ -40,6 +41,7 @@ class Panel(NamedTuple):
     normal: np.ndarray  # (L, 4, 3) power, axis
     vector: np.ndarray  # (L, lamps, 4, 3)
     axis: np.ndarray  # (lamps, 2, 3)
+    visible: np.ndarray  # (L, lamps) share of each lamp that reaches the layer
 
 
 @inner
@@ -53,12 +55,14 @@ def make_panel(n_layers: int, n_lamps: int) -> Panel:
         np.zeros((n, 4, 3)),
         np.zeros((n, n_lamps, 4, 3)),
         np.zeros((n_lamps, 2, 3)),
+        np.ones((n, n_lamps)),
     )
 
 
 @inlined
-def expand(span: Span, n_layers: int, lit: Lit, part: tuple[float, float], panel: Panel) -> None:
-    """Write the curves of a part of the span, given by its middle and half its length."""
+def expand(span: Span, n_layers: int, scene: tuple[Lit, Shade], part: tuple[float, float], panel: Panel) -> None:
+    """Write the curves of a part of the span, given by its middle and half length, and the light that reaches it."""
+    lit, shade = scene
     middle, half = part
     for m in range(n_layers):
         flags = span.flags[m]
@@ -74,6 +78,7 @@ def expand(span: Span, n_layers: int, lit: Lit, part: tuple[float, float], panel
             _cubics(span.normal[m], middle, half, panel.normal[m])
             for lamp in range(len(lit.kind)):
                 _cubics(span.vector[m, lamp], middle, half, panel.vector[m, lamp])
+                panel.visible[m, lamp] = visible_at(shade, lamp, span.receiver[m], middle)
                 if lit.kind[lamp] == SPOT:
                     for d in range(3):
                         change = span.axis[lamp, d, 1] - span.axis[lamp, d, 0]

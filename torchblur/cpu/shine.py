@@ -17,7 +17,7 @@ from torchblur.cpu.lambert import DIRECTIONAL, SPOT, Lit
 from torchblur.cpu.layers import FULL, Looks, lookup
 from torchblur.cpu.panels import Panel
 
-Seen = tuple[float, float, float, float, float]
+Seen = tuple[float, float, float, float, tuple[float, float]]
 
 
 @inlined
@@ -48,11 +48,11 @@ def level_at(panel: Panel, m: int, last: int, s: float) -> float:
 
 @inlined
 def look_at(span: Span, panel: Panel, m: int, scene: tuple[Looks, Lit], s: float) -> Seen:
-    """Return straight RGB, opacity, and the direct light, of a layer at a time `s` of a panel."""
+    """Return straight RGB, opacity, and the direct light due and arriving, of a layer at a time `s` of a panel."""
     looks, lit = scene
     face, flags = span.face[m], span.flags[m]
     red, green, blue, alpha = looks.rgb[face, 0], looks.rgb[face, 1], looks.rgb[face, 2], looks.opacity[face]
-    direct = 0.0
+    direct = (0.0, 0.0)
     if flags & TEXTURED:
         u, v = place_at(panel, m, s)
         mesh, level = looks.mesh_of[face], 0.0
@@ -85,14 +85,19 @@ def _size(x: float, y: float, z: float) -> float:
 
 
 @inlined
-def shine(span: Span, panel: Panel, m: int, lit: Lit, s: float) -> tuple[tuple[float, float, float], float]:
-    """Return what to multiply the colour of a lit layer by at `s`, and the direct light in it, summed over RGB."""
+def shine(
+    span: Span, panel: Panel, m: int, lit: Lit, s: float
+) -> tuple[tuple[float, float, float], tuple[float, float]]:
+    """Return what to multiply the colour of a lit layer by at `s`, and the direct light
+    that were there without shadows and that is, summed over RGB.
+    """
     scale = panel.scale[m, 0] + s * (panel.scale[m, 1] + s * panel.scale[m, 2])
     red, green, blue, direct = lit.ambient[0], lit.ambient[1], lit.ambient[2], 0.0
+    arriving = 0.0
     nx, ny, nz = _at(panel.normal[m], s)
     of_normal = _size(nx, ny, nz)
     if of_normal == 0 or scale == 0:
-        return (red, green, blue), direct
+        return (red, green, blue), (direct, arriving)
     nx, ny, nz = nx / of_normal, ny / of_normal, nz / of_normal
     for lamp in range(len(lit.kind)):
         kind = lit.kind[lamp]
@@ -109,11 +114,13 @@ def shine(span: Span, panel: Panel, m: int, lit: Lit, s: float) -> tuple[tuple[f
             share *= (scale / length) ** 2
         if kind == SPOT:
             share *= _in_cone(panel, lit, lamp, s, (x, y, z, np.sign(scale)))
+        whole = share * (lit.power[lamp, 0] + lit.power[lamp, 1] + lit.power[lamp, 2])
+        share *= panel.visible[m, lamp]
         red += share * lit.power[lamp, 0]
         green += share * lit.power[lamp, 1]
         blue += share * lit.power[lamp, 2]
-        direct += share * (lit.power[lamp, 0] + lit.power[lamp, 1] + lit.power[lamp, 2])
-    return (red, green, blue), direct
+        direct, arriving = direct + whole, arriving + whole * panel.visible[m, lamp]
+    return (red, green, blue), (direct, arriving)
 
 
 @inlined

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchblur import packed
 from torchblur.camera import Ray
 from torchblur.cells import Cells
-from torchblur.cpu import blend, expose
+from torchblur.cpu import blend, expose, receive
 from torchblur.cpu.curves import find_stock
 from torchblur.cpu.instant import looks_of, on_threads
 from torchblur.cpu.jit import announce
@@ -25,9 +25,12 @@ from torchblur.cpu.lambert import find_lit
 from torchblur.cpu.sweep import DEN, LOW, NUM, T_END, T_START
 from torchblur.cpu.tiles import Geometry, View
 from torchblur.intervals import Intervals
+from torchblur.ledger import Ledger
 from torchblur.prisms import Prisms
 from torchblur.scene import Scene
+from torchblur.shadows import find_shadows
 from torchblur.shutter import DIRECTIONS, Shutter
+from torchblur.surfaces import Surfaces
 from torchblur.survey import Survey
 
 JOBS_A_THREAD = 4  # portions of the tiles, so that threads end together
@@ -111,36 +114,68 @@ def composite(sight: Sight, scene: Scene, ray: Ray, may_cross: bool) -> tuple[Te
     return torch.from_numpy(image).movedim(2, 0), _total(counts)
 
 
-def integrate(
-    sight: Sight, scene: Scene, ray: Ray, may_cross: bool, memory_bytes: int
-) -> Iterator[tuple[Tensor | None, dict[str, int]]]:
-    """Look along all rays, some tiles at a time, and integrate what textures and lights make of it.
+def integrate(sight: Sight, scene: Scene, ray: Ray, may_cross: bool, limits: tuple[int, Ledger]) -> Tensor:
+    """Return what `composite` does, where textures, lights and shadows make something of it.
 
     Args:
-        sight, scene, ray, may_cross, memory_bytes: as in `list_seen`.
-
-    Yields:
-        By turns: nothing, once cells are listed, with the counts of these; then nothing, once they are integrated, with
-        the number of samples. At last what `composite` returns.
+        sight, scene, ray, may_cross: as in `composite`.
+        limits: about which memory what is listed at a time may take, and what to note counts and times in.
 
     Source: ours.
     """
+    memory_bytes, ledger = limits
     announce(expose.expose)
-    surfaces, camera = sight.prisms.surfaces, scene.camera
+    surfaces, camera, device = sight.prisms.surfaces, scene.camera, scene.device
     image = np.zeros((camera.height, camera.width, len(sight.colours.delay), blend.N_LOOKS + len(scene.meshes)))
     times = sorted({t for light in surfaces.lights for t in light.knots})
-    what = expose.Scene(
-        find_stock(sight.prisms),
-        looks_of(surfaces, scene, ray),
-        find_lit(scene, surfaces),
-        sight.colours,
-        np.array(times, dtype=np.float64),
-        _view(sight, scene, ray, may_cross),
-    )
-    for listings, counts in _list_tiles(sight, what.rays, blend.LIST_CELLS, memory_bytes):
-        yield None, counts
-        yield None, {"nodes": sum(on_threads(lambda listed: expose.expose(listed, what, image), listings))}
-    yield torch.from_numpy(image).movedim(2, 0), {}
+    with ledger.stage("intervals", device):
+        what = expose.Scene(
+            find_stock(sight.prisms),
+            looks_of(surfaces, scene, ray),
+            find_lit(scene, surfaces),
+            sight.colours,
+            np.array(times, dtype=np.float64),
+            _view(sight, scene, ray, may_cross),
+        )
+        tiles = _list_tiles(sight, what.rays, blend.LIST_CELLS, memory_bytes)
+    while True:
+        with ledger.stage("intervals", device):
+            listings, counts = next(tiles, (None, {}))
+        if listings is None:
+            return torch.from_numpy(image).movedim(2, 0)
+        ledger.add_many(counts)
+        shades, firsts = _find_shades(listings, what, surfaces, (image, ledger, device))
+        jobs = [(own, what, shades, (*first, False), image) for own, first in zip(listings, firsts, strict=True)]
+        with ledger.stage("resolve", device):
+            done = on_threads(lambda job: expose.expose(*job), jobs)
+        ledger.add("nodes", sum(n for n, _, _ in done))
+
+
+def _find_shades(
+    listings: list[blend.Listed], what: expose.Scene, surfaces: Surfaces, to: tuple[np.ndarray, Ledger, torch.device]
+) -> tuple[tuple[receive.Shade, receive.Shade], list[tuple[int, int]]]:
+    """Return when light is blocked on what is listed, over spans and at instants, and the numbers of the first
+    receivers of each listing; `to` is an image, which is not looked at, the ledger and its device.
+    """
+    image, ledger, device = to
+    none = receive.no_shade()
+    if surfaces.casters is None:
+        return (none, none), [(0, 0)] * len(listings)
+    with ledger.stage("nodes", device):
+        found = on_threads(lambda listed: expose.expose(listed, what, (none, none), (0, 0, True), image), listings)
+    shades, firsts = [], []
+    with ledger.stage("shadows", device):
+        for kind in (1, 2):
+            parts = [f[kind] for f in found]
+            counts = [int(p.count[0]) for p in parts]
+            firsts.append(np.cumsum([0, *counts])[:-1].tolist())
+            if not sum(counts):
+                shades.append(none)
+                continue
+            shadows = find_shadows(surfaces, *receive.as_receivers(parts, kind == 2))
+            ledger.add_shadows(shadows)
+            shades.append(receive.as_shade(surfaces, sum(counts), shadows))
+    return tuple(shades), list(zip(*firsts, strict=True))
 
 
 def list_seen(

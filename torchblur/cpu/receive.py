@@ -26,7 +26,7 @@ FIRST_ROOM = 256
 
 
 class Received(NamedTuple):
-    """Receivers."""
+    """Places that light falls on, over slices of time or at instants."""
 
     place: np.ndarray  # (room, 4, 3) coefficients of S times the place
     scale: np.ndarray  # (room, 3) of S, which is above 0

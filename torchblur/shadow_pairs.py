@@ -42,7 +42,7 @@ class _Swept:
     low: Tensor  # (2, n) float64
     high: Tensor  # (2, n)
     depth: Tensor  # (n,) from the light: the least of a caster, the greatest of a receiver
-    parts: Tensor  # (PARTS, 1 or 0, 4, n) least and greatest x and y of a caster in each part of its time; none of receivers
+    parts: Tensor  # (PARTS, 1 or 0, 4, n) least and greatest x and y of a caster in each part of its time
 
     def choose(self, chosen: Tensor) -> _Swept:
         """Return the things `chosen` (J,)."""
@@ -143,7 +143,7 @@ def _in_parts(linear: Tensor) -> Tensor:
 
 def _by_part(bounds: Tensor, n: int) -> Tensor:
     """Return bounds (4, parts * n) as (parts, 4, n)."""
-    return bounds.reshape(4, -1, n).transpose(0, 1)
+    return bounds.reshape(4, -1, max(n, 1)).transpose(0, 1)[..., :n]
 
 
 def _on_side(corners: Tensor, axes: tuple[int, int, int, float], extent: float) -> Tensor:

@@ -9,11 +9,12 @@ Source: ours.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
 
+from torchblur.lights import Light
 from torchblur.scene import Scene
 from torchblur.stopwatch import spent_on
 
@@ -33,6 +34,7 @@ class Casters:
     extent: float  # the largest side of that box, or distance of the box from the origin: the size of rounding
     moves: bool  # whether one of them does
     gap: float  # share of coordinates that a caster must be away from what it blocks
+    views: dict[Light, list] = field(default_factory=dict)  # what lights see of them, as shadow_pairs.py has found it
 
     @property
     def count(self) -> int:

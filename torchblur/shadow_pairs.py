@@ -28,6 +28,7 @@ FINEST = 10  # level
 AT_ONCE = 1 << 15  # pairs looked at together: 30 MB, which caches hold in part
 FEW_PAIRS = 1 << 17  # below, all pairs are looked at; cells would take longer
 PARTS = 8  # of a caster's time in which bounds are found, too: what moves fills little of what it sweeps
+MANY = 1 << 15  # casters, of more of which no parts are looked at: 256 bytes each, and several times that on the way
 SIDE = 2  # [-1, 1] is how wide the side of a cube is, from 0 to 2 in the units of `swept_bounds_px`
 NEAR = 1e-12  # of the casters' extent: nothing is nearer to a light
 SLACK = 1e-9  # of the casters' extent: widening of bounds against rounding
@@ -41,9 +42,7 @@ class _Swept:
     low: Tensor  # (2, n) float64
     high: Tensor  # (2, n)
     depth: Tensor  # (n,) from the light: the least of a caster, the greatest of a receiver
-    parts: (
-        Tensor  # (PARTS or 0, 4, n) least and greatest x and y of a caster in each part of its time; none of receivers
-    )
+    parts: Tensor  # (PARTS, 1 or 0, 4, n) least and greatest x and y of a caster in each part of its time
 
     def choose(self, chosen: Tensor) -> _Swept:
         """Return the things `chosen` (J,)."""
@@ -102,22 +101,13 @@ def together(parts: list[tuple[Tensor, Tensor]]) -> tuple[Tensor, Tensor]:
 
 def _cube_views(light: Light, receivers: Receivers, casters: Casters) -> Iterator[tuple[_Swept, _Swept]]:
     """Yield what is seen on the six sides of a cube around a light."""
-    ends = torch.stack([casters.t_open, casters.t_close])
-    corners = casters.world - torch.stack([along(light.position, t) for t in ends]).unsqueeze(1)  # (2, 3, 3, C)
     times = receivers.t[:1] if receivers.are_instants else receivers.t
     position = torch.stack([along(light.position, t) for t in times])
     vector = receivers.place - bernstein.product(receivers.scale.unsqueeze(1), position)  # (4 or 1, 3, K)
     scale = _raised(receivers.scale, len(vector))
-    for axis, side in itertools.product(range(3), (1.0, -1.0)):
-        a, b = (k for k in range(3) if k != axis)
-        axes = a, b, axis, side
-        bounds = _on_side(corners, axes, casters.extent)
-        every = torch.arange(casters.count, device=bounds.device)
-        caster = _in_side(every, bounds[:2], bounds[2:], (side * corners[:, :, axis]).amin((0, 1)))
-        if len(caster.which) == 0:
-            continue
-        parts = _on_side(_in_parts(corners[..., caster.which]), axes, casters.extent)
-        caster = replace(caster, parts=parts.reshape(4, PARTS, -1).transpose(0, 1))
+    if light not in casters.views:
+        casters.views[light] = _casters_on_sides(light, casters)
+    for (a, b, axis, side), caster in casters.views[light]:
         depth = side * vector[:, axis]
         is_ahead = (depth > 0).any(0).nonzero().flatten()
         depth = depth[:, is_ahead]
@@ -126,11 +116,34 @@ def _cube_views(light: Light, receivers: Receivers, casters: Casters) -> Iterato
         yield _in_side(is_ahead, low + 1, high + 1, furthest), caster
 
 
+def _casters_on_sides(light: Light, casters: Casters) -> list[tuple[tuple[int, int, int, float], _Swept]]:
+    """Return the casters on those sides of a cube around a light that see some, with both axes across, the axis along
+    and its sign.
+    """
+    ends = torch.stack([casters.t_open, casters.t_close])
+    corners = casters.world - torch.stack([along(light.position, t) for t in ends]).unsqueeze(1)  # (2, 3, 3, C)
+    every, found = torch.arange(casters.count, device=corners.device), []
+    for axis, side in itertools.product(range(3), (1.0, -1.0)):
+        axes = *(k for k in range(3) if k != axis), axis, side
+        bounds = _on_side(corners, axes, casters.extent)
+        caster = _in_side(every, bounds[:2], bounds[2:], (side * corners[:, :, axis]).amin((0, 1)))
+        if len(caster.which):
+            parts = _on_side(_in_parts(corners[..., caster.which]), axes, casters.extent)
+            found.append((axes, replace(caster, parts=_by_part(parts, len(caster.which)))))
+    return found
+
+
 def _in_parts(linear: Tensor) -> Tensor:
-    """Return (2, ..., PARTS * n) values at the ends of each part of a time in which (2, ..., n) change linearly."""
-    u = torch.linspace(0, 1, PARTS + 1, dtype=linear.dtype, device=linear.device).unsqueeze(1)
+    """Return (2, ..., parts * n) values at the ends of each part of a time in which (2, ..., n) change linearly."""
+    n_parts = PARTS if linear.shape[-1] <= MANY else 1
+    u = torch.linspace(0, 1, n_parts + 1, dtype=linear.dtype, device=linear.device).unsqueeze(1)
     at = (1 - u) * linear[0].unsqueeze(-2) + u * linear[1].unsqueeze(-2)  # (..., PARTS + 1, n)
     return torch.stack([at[..., :-1, :], at[..., 1:, :]]).flatten(-2)
+
+
+def _by_part(bounds: Tensor, n: int) -> Tensor:
+    """Return bounds (4, parts * n) as (parts, 4, n)."""
+    return bounds.reshape(4, -1, max(n, 1)).transpose(0, 1)[..., :n]
 
 
 def _on_side(corners: Tensor, axes: tuple[int, int, int, float], extent: float) -> Tensor:
@@ -174,7 +187,7 @@ def _directional_views(light: Light, receivers: Receivers, casters: Casters) -> 
         way, slack = torch.stack([along(light.direction, t) for t in ends[:, of]]), SLACK * casters.extent
         bounds, least = _on_plane(corners[..., of], way, axes, slack)
         parts, _ = _on_plane(_in_parts(corners[..., of]), _in_parts(way), axes, slack)
-        caster = _Swept(of, bounds[:2], bounds[2:], least, parts.reshape(4, PARTS, -1).transpose(0, 1))
+        caster = _Swept(of, bounds[:2], bounds[2:], least, _by_part(parts, len(of)))
         way = torch.stack([along(light.direction, t) for t in times[:, own]])
         low, high, _, most = _sheared(place[..., own], receivers.scale[:, own], way, axes)
         yield _Swept(own, low, high, most, _no_parts(own)), caster

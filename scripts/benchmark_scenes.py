@@ -45,6 +45,22 @@ def character(
     return _plain(paper_scenes.figure(16, paper_scenes.stride(motion), detail), opacity, (width, height))
 
 
+def textured_character(width: int, height: int) -> tb.Scene:
+    """Return the running figure with its textures."""
+    return _plain(paper_scenes.figure(16, paper_scenes.stride(), CHARACTER), None, (width, height))
+
+
+def million(width: int, height: int) -> tb.Scene:
+    """Return a thousand capsules of 1,026 triangles each that fly apart, as one mesh."""
+    random = torch.Generator().manual_seed(4)
+    vertices, faces, _ = paper_scenes.capsule(0.08, (0.035, 0.035), 1.0, 27)
+    n = 1000
+    place, way = ((torch.rand(n, 1, 3, dtype=torch.float64, generator=random) - 0.5) * s for s in (3.6, 0.3))
+    motion = torch.stack([(vertices + place + 0.5 * end * way).reshape(-1, 3) for end in (-1, 1)])
+    every = faces + len(vertices) * torch.arange(n).reshape(n, 1, 1)
+    return _plain([tb.Mesh(motion, every.reshape(-1, 3), name="capsules")], 1.0, (width, height))
+
+
 def cloth(width: int, height: int) -> tb.Scene:
     """Return a cloth of 63,368 triangles that sinks over a ball and swings."""
     n = 178
@@ -106,7 +122,8 @@ def _plain(meshes: list[tb.Mesh] | tuple[tb.Mesh, ...], opacity: float | None, s
         if opacity is not None:
             tint = torch.rand(1, 3, generator=random) * 0.7 + 0.1
             look = tb.Material(tint + 0.2 * torch.rand(mesh.n_faces, 3, generator=random), opacity)
-        plain.append(tb.Mesh(mesh.vertices.float(), mesh.faces, look, name=mesh.name))
+        uv = mesh.uv if look.texture is not None else None
+        plain.append(tb.Mesh(mesh.vertices.float(), mesh.faces, look, name=mesh.name, uv=uv))
     return tb.Scene(plain, paper_scenes.still_camera(*size), paper_scenes.BACKDROP)
 
 
@@ -115,6 +132,7 @@ CASES: dict[str, Case] = {
     "chip": Case(chip, 512, 1024),
     "small character": Case(lambda w, h: character(w, h, 1.0, SMALL_CHARACTER), 256, 256),
     "character": Case(character, 1920, 1080),
+    "textured character": Case(textured_character, 1920, 1080),
     "character, 4K": Case(character, 3840, 2160),
     "glass character": Case(lambda w, h: character(w, h, 0.5), 1920, 1080),
     "cloth": Case(cloth, 1024, 1024),
@@ -122,6 +140,7 @@ CASES: dict[str, Case] = {
     "pills": Case(pills, 1920, 1080),
     "shards": Case(shards, 256, 256),
 }
+LARGE = {"million, 8K": Case(million, 7680, 4320)}  # minutes
 
 CURVES: dict[str, tuple[tuple[float, ...], Callable[[float], tb.Scene]]] = {  # by what grows: values, scene at a value
     "triangles": (

@@ -1,6 +1,6 @@
 """What leaving out effects saves, and what each effect costs, side by side in one run.
 
-    python scripts/effects.py [--size 192] [--repeats 3]
+    python scripts/effects.py [--size 192] [--repeats 5]
 
 First table: typical scenes, with the effects that they call for against all of them. Second table: the cheapest scene,
 and the same with one effect more. Times are CPU times of a single thread, the least of interleaved repetitions.
@@ -82,24 +82,25 @@ def scene(size: int, meshes: list[tb.Mesh], lights: list | None = None) -> tb.Sc
     return tb.Scene(meshes, camera, (0.2, 0.3, 0.4), lights=lights or [], ambient=(0.1, 0.1, 0.1))
 
 
-def timed(renders: dict[str, Callable[[], tb.Frame]], repeats: int) -> dict[str, tuple[float, tb.Frame]]:
-    """Return the least CPU time of each, and the frame that took it; they take turns."""
-    found: dict[str, tuple[float, tb.Frame]] = {}
+def timed(renders: dict[str, Callable[[], tb.Frame]], repeats: int) -> dict[str, tuple[float, float, tb.Frame]]:
+    """Return the least CPU time of each, the share of a frame that planning took, and a frame; they take turns."""
+    found: dict[str, list[tuple[float, float, float, tb.Frame]]] = {}
     for _ in range(repeats):
         for name, render in renders.items():
             start = time.process_time()
             frame = render()
             seconds = time.process_time() - start
-            if name not in found or seconds < found[name][0]:
-                found[name] = seconds, frame
-    return found
+            own = seconds, frame.timings["plan"], sum(frame.timings.values()), frame
+            found.setdefault(name, []).append(own)
+    least = {name: [min(each) for each in list(zip(*runs, strict=True))[:3]] for name, runs in found.items()}
+    return {name: (seconds, plan / whole, found[name][0][3]) for name, (seconds, plan, whole) in least.items()}
 
 
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=int, default=192, help="width and height [px]")
-    parser.add_argument("--repeats", type=int, default=3, help="interleaved repetitions that are timed")
+    parser.add_argument("--repeats", type=int, default=5, help="interleaved repetitions that are timed")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     print(f"{arguments.size} px, float32, {platform.machine()}, one thread, torch {torch.__version__}\n")
@@ -107,14 +108,13 @@ def main() -> None:
     for name, each in scenes(arguments.size).items():
         options = {effects: (lambda e=effects, s=each: tb.render(s, effects=e)) for effects in ("auto", "all")}
         found = timed(options, arguments.repeats)
-        seconds, frame = found["auto"]
-        share = frame.timings["plan"] / sum(frame.timings.values())
+        seconds, share, frame = found["auto"]
         needs = ", ".join(e.name for e in frame.plan.effects if e.needed)
         print(f"| {name} | {needs} | {seconds:.2f} s | {found['all'][0] / seconds:.1f}x | {share:.1%} |", flush=True)
     found = timed({n: (lambda s=s: tb.render(s)) for n, s in ablation(arguments.size).items()}, arguments.repeats)
     base = next(iter(found.values()))[0]
     print("\n| scene | time | intervals | nodes |\n|---|--:|--:|--:|")
-    for name, (seconds, frame) in found.items():
+    for name, (seconds, _, frame) in found.items():
         print(f"| {name} | {seconds / base:.1f}x | {frame.counts['intervals']:,} | {frame.counts['nodes']:,} |")
 
 

@@ -9,6 +9,7 @@ and the same with one effect more. Times are CPU times of a single thread, the l
 from __future__ import annotations
 
 import argparse
+import functools
 import platform
 import time
 from collections.abc import Callable
@@ -100,18 +101,23 @@ def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--size", type=int, default=192, help="width and height [px]")
+    parser.add_argument("--backend", choices=("auto", "torch"), default="auto", help="compiled, or plain torch")
     parser.add_argument("--repeats", type=int, default=5, help="interleaved repetitions that are timed")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    print(f"{arguments.size} px, float32, {platform.machine()}, one thread, torch {torch.__version__}\n")
+    print(
+        f"{arguments.size} px, float32, {platform.machine()}, one thread, torch {torch.__version__}, {arguments.backend}\n"
+    )
     print("| scene | needs | auto | all | planning |\n|---|---|--:|--:|--:|")
     for name, each in scenes(arguments.size).items():
-        options = {effects: (lambda e=effects, s=each: tb.render(s, effects=e)) for effects in ("auto", "all")}
+        make = functools.partial(tb.render, each, backend=arguments.backend)
+        options = {effects: functools.partial(make, effects=effects) for effects in ("auto", "all")}
         found = timed(options, arguments.repeats)
         seconds, share, frame = found["auto"]
         needs = ", ".join(e.name for e in frame.plan.effects if e.needed)
         print(f"| {name} | {needs} | {seconds:.2f} s | {found['all'][0] / seconds:.1f}x | {share:.1%} |", flush=True)
-    found = timed({n: (lambda s=s: tb.render(s)) for n, s in ablation(arguments.size).items()}, arguments.repeats)
+    each = ablation(arguments.size).items()
+    found = timed({n: functools.partial(tb.render, s, backend=arguments.backend) for n, s in each}, arguments.repeats)
     base = next(iter(found.values()))[0]
     print("\n| scene | time | intervals | nodes |\n|---|--:|--:|--:|")
     for name, (seconds, _, frame) in found.items():

@@ -337,13 +337,14 @@ def test_a_path_that_is_a_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["folder", "shards"])
-def test_a_damaged_record_of_the_run_is_written_again_where_the_frames_bear_it_out(tmp_path, storage):
+def test_a_damaged_or_missing_record_of_the_run_is_written_again_where_the_frames_bear_it_out(tmp_path, storage):
     fields = {"storage": storage, "frames_per_shard": 2}
     folder = tmp_path / "data"
     generate(spec(**fields), folder)
     whole = sums(folder)
     record = (folder / "run.json").read_bytes()
     damages = (
+        None,
         b"",
         record[:-9],
         record.replace(b'"seed": 4', b'"seed": 5'),
@@ -351,19 +352,25 @@ def test_a_damaged_record_of_the_run_is_written_again_where_the_frames_bear_it_o
     )
     for damaged in damages:
         assert damaged != record
-        (folder / "run.json").write_bytes(damaged)
+        damage(folder / "run.json", damaged)
         assert verify_dataset(folder) != []
         for other in ({"seed": 5}, {"count": 2}):
             with pytest.raises(SpecError):
                 generate(spec(**fields | other), folder)
-            assert (folder / "run.json").read_bytes() == damaged
+            assert damaged == ((folder / "run.json").read_bytes() if (folder / "run.json").exists() else None)
         result = generate(spec(**fields | {"storage": "auto"}), folder)
         assert (result.made, result.kept) == (0, 4)
         assert "run.json" in result.repaired[0]
         assert sums(folder) == whole
         assert verify_dataset(folder) == []
-    (folder / "run.json").write_bytes(b"")
     for place in (*folder.glob("manifest.jsonl"), *folder.glob("shards/*.json")):
         place.unlink()
-    with pytest.raises(SpecError, match=r"run\.json"):  # nothing bears it out
-        generate(spec(**fields), folder)
+    for damaged in (None, b""):
+        damage(folder / "run.json", damaged)
+        with pytest.raises(SpecError, match=r"run\.json"):  # nothing bears it out
+            generate(spec(**fields), folder)
+
+
+def damage(place, data):
+    """Give a file other bytes, or take it away."""
+    place.unlink() if data is None else place.write_bytes(data)

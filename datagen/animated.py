@@ -16,7 +16,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from datagen.assets import SMALLEST_EXTENT, check_geometry, file_state, has_area
+from datagen.assets import SMALLEST_EXTENT, check_geometry, file_state, has_area, split_looks
 from datagen.formats import MeshError, Surface, short_reason
 from datagen.gltf import GltfFile
 from datagen.gltf_rigs import read_rig
@@ -231,11 +231,9 @@ def _usd_asset(path: Path) -> AnimatedAsset:
 
 def _asset(path: Path, poses: Sequence[tuple[str, Pose]], surface: Surface, sha256: str) -> AnimatedAsset:
     """Return the asset of a surface and its named poses."""
-    faces, color, opacity = torch.from_numpy(surface.faces), None, None
+    faces = torch.from_numpy(surface.faces)
     actions = tuple(measure(path, name, pose, faces) for name, pose in poses)
-    if surface.rgba is not None:
-        rgba = torch.from_numpy(surface.rgba)
-        color, opacity = rgba[:, :3].contiguous(), rgba[:, 3].contiguous() if bool((rgba[:, 3] < 1).any()) else None
+    color, opacity = split_looks(surface.rgba)
     return AnimatedAsset(path.name, actions, faces, color, opacity, surface.notes, sha256)
 
 

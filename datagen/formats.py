@@ -51,11 +51,16 @@ def join_parts(faces: Sequence[np.ndarray], looks: Sequence[np.ndarray | None], 
 
     Source: ours.
     """
-    rgba = None
-    if any(look is not None for look in looks):
-        filled = [NO_LOOK.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)]
-        rgba = np.concatenate(filled)
-    return Surface(np.concatenate(faces), rgba, tuple(dict.fromkeys(notes)))
+    return Surface(np.concatenate(faces), join_looks(faces, looks, NO_LOOK), tuple(dict.fromkeys(notes)))
+
+
+def join_looks(
+    faces: Sequence[np.ndarray], looks: Sequence[np.ndarray | None], no_look: np.ndarray
+) -> np.ndarray | None:
+    """Return the (F, 4) looks of all parts, `no_look` (1, 4) for one without; none if no part has any. Source: ours."""
+    if all(look is None for look in looks):
+        return None
+    return np.concatenate([no_look.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)])
 
 
 def short_reason(error: BaseException) -> str:

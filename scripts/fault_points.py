@@ -205,8 +205,7 @@ def break_and_finish(out: Path, words: list[str], fault: Fault, whole: dict[str,
         problems.append(f"ended with {ended.status}, not {wanted}: {ended.told[-300:]!r}")
     if not ended.is_alone:
         problems.append(f"processes alive {ORPHAN_SECONDS} s later")
-    if (out / "run.json").exists() and ((out / MANIFEST_NAME).exists() or (out / "shards").exists()):
-        problems += verify_dataset(out)  # what is listed is whole, right after the fault
+    problems += listed_damage(out)
     if (unlisted := _finished(out) - _listed(out)) > workers:
         problems.append(f"{unlisted} finished but not listed, by {workers} workers")
     again = run(words, None)
@@ -215,6 +214,12 @@ def break_and_finish(out: Path, words: list[str], fault: Fault, whole: dict[str,
     found = sums(out)
     problems += [f"{name} differs" for name in sorted({**found, **whole}) if found.get(name) != whole.get(name)]
     return problems
+
+
+def listed_damage(out: Path) -> list[str]:
+    """Return what of that which is listed is not whole, right after a fault, be there a list or not."""
+    is_begun = (out / "run.json").exists() and ((out / MANIFEST_NAME).exists() or (out / "shards").exists())
+    return verify_dataset(out) if is_begun else []
 
 
 def _finished(out: Path) -> int:

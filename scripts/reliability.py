@@ -122,7 +122,7 @@ def break_at_each_step(storage: str, frames: int) -> int:
 
 
 def fill_disks(base: Path, storage: str, count: int) -> int:
-    """Run on disks of a share of the room that is needed, then make them larger; return how many problems there were."""
+    """Run on disks that are too small, then make them larger; return how many problems there were."""
     whole, place = base / f"{storage}-whole", base / "disk"
     place.mkdir(exist_ok=True)
     needed_kib, wanted, broken, full = (

@@ -57,12 +57,13 @@ def test_a_run_killed_at_any_step_is_finished_by_a_rerun_and_leaves_no_process(o
 
 
 @pytest.mark.parametrize("storage", [FOLDER, SHARDS])
-@pytest.mark.parametrize("times", [1, 5], ids=["once", "until it is given up"])
-def test_a_worker_killed_at_any_step_loses_and_doubles_nothing(storage, times):
+@pytest.mark.parametrize(("times", "stride"), [(1, 1), (5, 3)], ids=["once", "until it is given up"])
+def test_a_worker_killed_at_any_step_loses_and_doubles_nothing(storage, times, stride):
     """Killed once, the run itself ends whole; given up after three times, a rerun makes it so."""
-    told, points, problems = try_points(f"{storage} --workers 2 --victim worker --way kill-after --times {times}")
+    options = f"--workers 2 --victim worker --way kill-after --times {times} --stride {stride}"
+    told, points, problems = try_points(f"{storage} {options}")
     assert problems == 0, told
-    assert points >= 2 * 12
+    assert points >= 2 * 12 / stride
 
 
 @pytest.mark.parametrize("storage", [FOLDER, SHARDS])

@@ -125,7 +125,7 @@ def _arm(fault: Fault, tokens: int) -> None:
             _strike(fault, token, is_done=False)
             try:
                 return real(*arguments, **options)
-            finally:  # a folder that is there already is a step, too
+            finally:
                 _strike(fault, token, is_done=True)
 
         return call
@@ -149,7 +149,13 @@ def _arm(fault: Fault, tokens: int) -> None:
 
     pathlib.Path.open = opened  # type: ignore[assignment]
     os.write = written
-    for name in ("fsync", "replace", "unlink", "mkdir"):
+    real_mkdir, guarded_mkdir = os.mkdir, guarded(os.mkdir)
+
+    def made(path: Any, *arguments: Any, **options: Any) -> None:  # one that is there asks for nothing
+        (real_mkdir if Path(path).is_dir() else guarded_mkdir)(path, *arguments, **options)
+
+    os.mkdir = made
+    for name in ("fsync", "replace", "unlink"):
         if name == "unlink" and fault.way.startswith("full"):
             continue  # takes no room
         setattr(os, name, guarded(getattr(os, name)))

@@ -8,6 +8,7 @@ Source: ours.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -15,8 +16,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from datagen.assets import SMALLEST_EXTENT, check_geometry, file_state, has_area
-from datagen.formats import MeshError, short_reason
+from datagen.assets import SMALLEST_EXTENT, check_geometry, file_state, has_area, split_looks
+from datagen.formats import MeshError, Surface, short_reason
 from datagen.gltf import GltfFile
 from datagen.gltf_rigs import read_rig
 from datagen.motions import RigidMotion
@@ -218,21 +219,22 @@ def _gltf_asset(path: Path) -> AnimatedAsset:
     """Return the asset of a glTF file."""
     file = GltfFile(path)
     read = read_rig(file)
-    digest = file.digest.hexdigest()
-    actions = tuple(measure(path, take.name, RigPose(read.rig, take), read.faces) for take in read.takes)
-    return AnimatedAsset(path.name, actions, read.faces, read.color, read.opacity, read.notes, digest)
+    poses = [(take.name, RigPose(read.rig, take)) for take in read.takes]
+    return _asset(path, poses, read.surface, file.digest.hexdigest())
 
 
 def _usd_asset(path: Path) -> AnimatedAsset:
     """Return the asset of a USD file."""
     read = read_usd(path)
-    faces = torch.from_numpy(read.faces)
-    action = measure(path, "time samples", UsdPose(read), faces)
-    color, opacity = None, None
-    if read.rgba is not None:
-        rgba = torch.from_numpy(read.rgba)
-        color, opacity = rgba[:, :3].contiguous(), rgba[:, 3].contiguous() if bool((rgba[:, 3] < 1).any()) else None
-    return AnimatedAsset(path.name, (action,), faces, color, opacity, read.notes, read.sha256)
+    return _asset(path, [("time samples", UsdPose(read))], read.surface, read.sha256)
+
+
+def _asset(path: Path, poses: Sequence[tuple[str, Pose]], surface: Surface, sha256: str) -> AnimatedAsset:
+    """Return the asset of a surface and its named poses."""
+    faces = torch.from_numpy(surface.faces)
+    actions = tuple(measure(path, name, pose, faces) for name, pose in poses)
+    color, opacity = split_looks(surface.rgba)
+    return AnimatedAsset(path.name, actions, faces, color, opacity, surface.notes, sha256)
 
 
 def measure(path: Path, name: str, pose: Pose, faces: Tensor) -> Action:

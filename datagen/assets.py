@@ -21,7 +21,7 @@ import trimesh
 from torch import Tensor
 
 from datagen.colour import linear_from_srgb
-from datagen.formats import MeshError, announced_faces, read_checked, short_reason, utf8_text
+from datagen.formats import MeshError, announced_faces, join_looks, read_checked, short_reason, utf8_text
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 MAX_FACES = 50_000_000
@@ -29,6 +29,7 @@ MAX_VERTICES = 25_000_000
 MAX_COORDINATE = 1e6  # beyond it float32 positions are coarser than a thousandth
 SMALLEST_EXTENT = 1e-12  # of what is scaled to a radius of 1: below it there is rounding only
 FACES_AT_ONCE = 1_000_000
+NO_SRGB_LOOK = np.array([[0.7, 0.7, 0.7, 1.0]])  # of parts without a colour beside parts that have one
 DEFAULT_GREYS = ((102, 102, 102), (128, 128, 128))  # trimesh's own colour where a file has none
 
 
@@ -137,13 +138,20 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
     checked = [check_geometry(path, p[0], p[1], len(p[0])) for p in parts]
     starts = np.cumsum([0, *[len(v) for v, _ in checked]])
     faces = torch.cat([f + int(start) for (_, f), start in zip(checked, starts, strict=False)])
-    rgba = None
-    if any(p[2] is not None for p in parts):
-        filled = [np.full((len(p[1]), 4), 0.7) if p[2] is None else p[2] for p in parts]
-        rgba = torch.from_numpy(np.concatenate(filled))
-    color = None if rgba is None else linear_from_srgb(rgba[:, :3].contiguous())
-    opacity = rgba[:, 3].contiguous() if rgba is not None and bool((rgba[:, 3] < 1).any()) else None
+    color, opacity = split_looks(join_looks([p[1] for p in parts], [p[2] for p in parts], NO_SRGB_LOOK))
+    color = None if color is None else linear_from_srgb(color)
     return torch.cat([v for v, _ in checked]), faces, color, opacity, notes
+
+
+def split_looks(looks: np.ndarray | None) -> tuple[Tensor | None, Tensor | None]:
+    """Return the (F, 3) colours and the (F,) opacity of (F, 4) looks; none if there are none, or all are opaque.
+
+    Source: ours.
+    """
+    if looks is None:
+        return None, None
+    rgba = torch.from_numpy(looks)
+    return rgba[:, :3].contiguous(), rgba[:, 3].contiguous() if bool((rgba[:, 3] < 1).any()) else None
 
 
 def _part(scene: Any, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:

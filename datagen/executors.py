@@ -17,6 +17,11 @@ from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wai
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
 # torch is imported in functions: a new process must watch over the driver before it spends seconds on that.
 MAX_TRIES = 3  # of a frame whose process died; an exception is not tried again, as it would come again
 
@@ -139,7 +144,7 @@ def _end_pool(pool: ProcessPoolExecutor, is_idle: bool) -> None:
 
 def _begin_process() -> None:
     """Prepare a worker: no life after the driver's, the interrupt left to the driver, one torch thread."""
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _end_with_parent()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     import torch
 
@@ -147,8 +152,21 @@ def _begin_process() -> None:
 
 
 def _end_with_parent() -> None:
-    """Wait for the driver to end, killed or not, and end this process too."""
+    """Let this process end when its driver does, killed or not: by a thread, and where possible by the system.
+
+    A thread waits for as long as an import or compiled code holds the interpreter; SIGIO, which is sent when the
+    driver's end of the pipe closes, does not.
+    """
     parent = multiprocessing.parent_process()
-    if parent is not None:
+    if parent is None:
+        return
+
+    def wait_and_end() -> None:
         parent.join()
         os._exit(1)
+
+    threading.Thread(target=wait_and_end, daemon=True).start()
+    if fcntl is not None and hasattr(os, "O_ASYNC"):
+        pipe = parent.sentinel
+        fcntl.fcntl(pipe, fcntl.F_SETOWN, os.getpid())
+        fcntl.fcntl(pipe, fcntl.F_SETFL, fcntl.fcntl(pipe, fcntl.F_GETFL) | os.O_ASYNC)

@@ -115,12 +115,12 @@ def settle_storage(spec: DatasetSpec, folder: Path) -> DatasetSpec:
     """
     if spec.storage != "auto":
         return spec
-    storage = "shards" if spec.count >= SHARDS_FROM else "folder"
-    if (folder / RUN_NAME).exists():
-        try:
-            storage = read_run(folder)["spec"].get("storage", "folder")
-        except SpecError:  # what is there tells, too
-            storage = "shards" if (folder / SHARD_FOLDER).is_dir() else "folder"
+    try:
+        storage = read_run(folder)["spec"].get("storage", "folder")
+    except SpecError:  # what is there tells, too
+        held = (name for name in (SHARD_FOLDER, *FOLDERS) if next((folder / name).glob("[0-9]*"), None))
+        by_count = SHARD_FOLDER if spec.count >= SHARDS_FROM else FOLDERS[0]
+        storage = "shards" if next(held, by_count) == SHARD_FOLDER else "folder"
     return spec.model_copy(update={"storage": storage})
 
 
@@ -131,7 +131,7 @@ def check_run(folder: Path, plan: Plan, is_borne_out: Callable[[], bool | None])
         folder: of the data set.
         plan: what is to be made.
         is_borne_out: tells whether all frames that are listed are the plan's, none if there are no frames. It is asked
-            where the record of the run is damaged, and then decides.
+            where the record of the run is damaged or missing, and then decides.
 
     Raises:
         SpecError: the folder holds data of another configuration; the fields that differ are named.
@@ -155,6 +155,8 @@ def check_run(folder: Path, plan: Plan, is_borne_out: Callable[[], bool | None])
         if borne_out is False or (borne_out is None and problems):
             raise SpecError(problems or [f"out: expected frames as {RUN_NAME} has them in {folder}, got others"])
         return [f"{RUN_NAME}: expected a record with its checksum, got another; written again"]
+    if is_borne_out():
+        return [f"{RUN_NAME}: expected the record of the run, got none; written again"]
     strange = sorted(p.name for p in folder.iterdir() if not _is_left_by_a_start(p))
     if strange:  # people's own files are not to be mixed with, still less swept
         found = ", ".join(strange[:3]) + (", …" if len(strange) > 3 else "")

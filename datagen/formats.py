@@ -7,12 +7,17 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 MAX_FILE_BYTES = 256 * 2**20  # parsing takes several times as much memory
 MAX_PLAYED_VERTICES = 500_000  # of a mesh that moves by itself: it is held at some 100 instants at once
 MAX_PLAYED_FACES = 1_000_000
+NO_LOOK = np.array([[0.45, 0.45, 0.45, 1.0]])  # linear; of parts without a colour beside parts that have one
 READABLE_EXTENSIONS = re.compile(r"KHR_(materials_\w+|texture_transform|lights_punctual)")
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
 STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
@@ -25,6 +30,37 @@ class MeshError(ValueError):
     def __init__(self, path: str | Path, reason: str) -> None:
         super().__init__(f"{path}: {reason}")
         self.path, self.reason = str(path), reason
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """What of a mesh that moves by itself is the same at all times: F faces of all parts, one after the other."""
+
+    faces: np.ndarray  # (F, 3) int64
+    rgba: np.ndarray | None  # (F, 4) float64 linear, or none in the file
+    notes: tuple[str, ...]  # what in the file is not used
+
+
+def join_parts(faces: Sequence[np.ndarray], looks: Sequence[np.ndarray | None], notes: Sequence[str]) -> Surface:
+    """Return the surface of parts.
+
+    Args:
+        faces: (F, 3) of each part, at least one.
+        looks: (F, 4) linear colour and opacity of each part, or none.
+        notes: may repeat themselves.
+
+    Source: ours.
+    """
+    return Surface(np.concatenate(faces), join_looks(faces, looks, NO_LOOK), tuple(dict.fromkeys(notes)))
+
+
+def join_looks(
+    faces: Sequence[np.ndarray], looks: Sequence[np.ndarray | None], no_look: np.ndarray
+) -> np.ndarray | None:
+    """Return the (F, 4) looks of all parts, `no_look` (1, 4) for one without; none if no part has any. Source: ours."""
+    if all(look is None for look in looks):
+        return None
+    return np.concatenate([no_look.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)])
 
 
 def short_reason(error: BaseException) -> str:

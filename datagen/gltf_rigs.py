@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from datagen.formats import MAX_PLAYED_FACES, MAX_PLAYED_VERTICES
+from datagen.formats import MAX_PLAYED_FACES, MAX_PLAYED_VERTICES, Surface, join_parts
 from datagen.gltf import GltfFile
 from datagen.gltf_looks import face_looks
 from datagen.gltf_takes import n_targets, read_takes, unit_quaternion
@@ -23,7 +23,6 @@ from datagen.rigs import Node, Part, Rig, Skin, Take
 MAX_NODES = 4096
 MAX_WORK = 100_000_000  # of all animations, as `Rig.work`: each is measured at some 100 instants, twice
 TRIANGLES, STRIP, FAN = 4, 5, 6
-NO_LOOK = np.array([[0.45, 0.45, 0.45, 1.0]])  # linear; of parts without a colour beside parts that have one
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +31,7 @@ class RigFile:
 
     rig: Rig
     takes: tuple[Take, ...]  # at least one
-    faces: Tensor  # (F, 3) int64
-    color: Tensor | None  # (F, 3) float64 linear, or none in the file
-    opacity: Tensor | None  # (F,) float64, or none in the file
-    notes: tuple[str, ...]  # what in the file is not used
+    surface: Surface
 
 
 def read_rig(file: GltfFile) -> RigFile:
@@ -77,13 +73,7 @@ def read_rig(file: GltfFile) -> RigFile:
     if sum(rig.work + 2_000 * len(take.curves) for take in takes) > MAX_WORK:
         size = f"{len(nodes)} nodes, {rig.n_vertices} vertices and {len(takes)} animations"
         raise file.fail(f"expected nodes, vertices with their joints and targets, and animations in bounds, got {size}")
-    rgba = None
-    if any(look is not None for look in looks):
-        filled = [NO_LOOK.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)]
-        rgba = torch.from_numpy(np.concatenate(filled))
-    color = None if rgba is None else rgba[:, :3].contiguous()
-    opacity = rgba[:, 3].contiguous() if rgba is not None and bool((rgba[:, 3] < 1).any()) else None
-    return RigFile(rig, takes, torch.from_numpy(np.concatenate(faces)), color, opacity, tuple(dict.fromkeys(notes)))
+    return RigFile(rig, takes, join_parts(faces, looks, notes))
 
 
 def _nodes(file: GltfFile) -> tuple[tuple[Node, ...], tuple[int, ...]]:

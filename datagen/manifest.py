@@ -62,7 +62,7 @@ def begin_run(folder: Path, plan: Plan) -> Holdings:
         raise SpecError([f"out: expected frames of configuration {wanted_sum} in {folder}, got {min(found)}"])
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
-    sweep((folder, *(folder / name for name in FOLDERS)))
+    sweep_frames(folder)
     entries, damaged = {}, {}
     for entry in lines:
         problem = _damage(folder, entry, plan)
@@ -95,6 +95,11 @@ def read_manifest(folder: str | Path) -> dict[int, dict[str, Any]]:
         if entries.setdefault(entry["index"], entry) != entry:
             raise ManifestError(f"{folder}: expected one entry of frame {entry['index']}, got two that differ")
     return dict(sorted(entries.items()))
+
+
+def sweep_frames(folder: Path) -> None:
+    """Remove what killed processes left in a folder of frames that only this run works in. Source: ours."""
+    sweep((folder, *(folder / name for name in FOLDERS)))
 
 
 def append_entry(folder: Path, entry: dict[str, Any]) -> None:

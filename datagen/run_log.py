@@ -2,24 +2,25 @@
 
 Before: folders.py, writer.py.  After: runs.py writes it, pages.py and checks.py read it.
 `.runs.log` has one line of JSON for each run that made or failed to make a frame; a run that was killed has none.
-Slices append to the same file, a line in one write. Each line has its checksum; a run of the whole set drops those
+Slices append to the same file, one at a time. Each line has its checksum; a run of the whole set drops those
 that were damaged.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from datagen.folders import record_sum
+from datagen.folders import one_at_a_time, record_sum
 from datagen.writer import write_atomically
 
 LOG_NAME = ".runs.log"
@@ -64,13 +65,9 @@ def logged_run(folder: Path, workers: int, part: str) -> Iterator[RunNote]:
     finally:
         note.seconds = time.monotonic() - start
         if note.made or note.failed:
-            line = encode_line(asdict(note))
             try:
-                descriptor = os.open(folder / LOG_NAME, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-                try:
-                    os.write(descriptor, line)
-                finally:
-                    os.close(descriptor)
+                with one_at_a_time(folder) if part else nullcontext():
+                    _add_line(folder / LOG_NAME, encode_line(asdict(note)))
             except OSError as error:
                 print(f"{folder / LOG_NAME}: expected to add a line, got {error.strerror}", file=sys.stderr)
 
@@ -105,6 +102,18 @@ def read_log(folder: str | Path) -> tuple[list[RunNote], int]:
 def encode_line(fields: dict[str, Any]) -> bytes:
     """Return a note's fields as its line of the log, with its checksum. Source: ours."""
     return json.dumps(fields | {"line_sha256": record_sum(fields)}, sort_keys=True).encode() + b"\n"
+
+
+def _add_line(place: Path, line: bytes) -> None:
+    """Add a line to the log, or nothing of it where the disk has no room for the whole."""
+    descriptor = os.open(place, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        before = os.fstat(descriptor).st_size
+        if os.write(descriptor, line) < len(line):
+            os.ftruncate(descriptor, before)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    finally:
+        os.close(descriptor)
 
 
 def _drop_damaged_lines(folder: Path) -> None:

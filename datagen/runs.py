@@ -15,7 +15,7 @@ from typing import Any
 from datagen.ahead import compile_ahead
 from datagen.executors import Outcome, Task, run_processes, run_serial
 from datagen.folders import Slice, encode_run, locked_folder, record_sum, settle_storage
-from datagen.manifest import Holdings, append_entry, begin_run, write_manifest
+from datagen.manifest import Holdings, append_entry, begin_run, sweep_frames, write_manifest
 from datagen.progress import Progress
 from datagen.ray_executor import check_ray, run_ray
 from datagen.report import effect_shares, write_contact_sheet
@@ -23,7 +23,7 @@ from datagen.run_log import logged_run
 from datagen.samples import Sample, make_sample
 from datagen.scenes import Plan, plan_from_json, survey_plan
 from datagen.sensor import photograph
-from datagen.shards import begin_shards, run_shards, shard_frames, write_shard
+from datagen.shards import begin_shards, run_shards, shard_frames, sweep_shards, write_shard
 from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import write_atomically, write_frame
 
@@ -127,6 +127,9 @@ def generate(
                     progress.step(is_done=True)
         if run.task is make_frame:
             write_manifest(folder, entries)
+            sweep_frames(folder)
+        else:
+            sweep_shards(folder, spec, part)
         failed.sort()
         _write_failures(folder, failed, list(refused), part)
         sheet = write_contact_sheet(folder) if entries and part is None else None

@@ -79,11 +79,9 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
     with one_at_a_time(folder):
         notes = check_run(folder, plan, lambda: _bear_out(folder, plan))
         (folder / SHARD_FOLDER).mkdir(exist_ok=True)
-        if part is None:
-            sweep((folder, folder / SHARD_FOLDER))
-        else:  # other slices may be at work on the other shards
-            sweep((folder / SHARD_FOLDER,), [Path(path(n)).name for n in numbers for path in (tar_path, marker_path)])
+        if part is not None:
             sweep((folder,), (RUN_NAME, f"*-{part.number}-of-{part.of}.json"))
+        sweep_shards(folder, plan.spec, part)
         write_run(folder, plan)
     entries: dict[int, dict[str, Any]] = {}
     damaged: dict[int, str] = {}
@@ -106,6 +104,15 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
         elif [entry["index"] for entry in held] == list(shard_frames(plan.spec, number)):
             entries |= {entry["index"]: entry for entry in held}
     return Holdings(entries, damaged, tuple(notes))
+
+
+def sweep_shards(folder: Path, spec: DatasetSpec, part: Slice | None = None) -> None:
+    """Remove what killed processes left of a run's shards; without a slice, all that was left. Source: ours."""
+    if part is None:
+        sweep((folder, folder / SHARD_FOLDER))
+        return
+    numbers = run_shards(spec, part)  # other slices may be at work on the other shards
+    sweep((folder / SHARD_FOLDER,), [Path(path(n)).name for n in numbers for path in (tar_path, marker_path)])
 
 
 def write_shard(

@@ -27,8 +27,11 @@ from datagen.formats import (
     MAX_FILE_BYTES,
     MAX_PLAYED_FACES,
     MAX_PLAYED_VERTICES,
+    NO_LOOK,
     MeshError,
+    Surface,
     check_size,
+    join_parts,
     short_reason,
 )
 
@@ -46,10 +49,8 @@ class UsdMeshes:
     """What a file holds, its meshes one after the other, with y up."""
 
     keys_s: np.ndarray  # (T,) float64, the times of all samples, at least one
-    faces: np.ndarray  # (F, 3) int64
-    rgba: np.ndarray | None  # (F, 4) float64 linear, or none in the file
     at: Callable[[float], np.ndarray]  # time [s] -> (V, 3) float64 world positions
-    notes: tuple[str, ...]  # what in the file is not used
+    surface: Surface
     sha256: str  # of all files that were read
 
 
@@ -141,17 +142,12 @@ def _read(path: Path) -> UsdMeshes:
         notes += _unread(mesh)
     if not meshes:
         raise MeshError(path, "expected triangles, got none")
-    rgba = None
-    if any(look is not None for look in looks):
-        grey = np.array([[0.45, 0.45, 0.45, 1.0]])
-        filled = [grey.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)]
-        rgba = np.concatenate(filled).clip(0, 1)
 
     def at(time_s: float) -> np.ndarray:
         return _positions(path, stage, meshes, time_s * rate)
 
     times = np.array(sorted(keys) or [0.0]) / rate
-    return UsdMeshes(times, np.concatenate(faces), rgba, at, tuple(dict.fromkeys(notes)), digest)
+    return UsdMeshes(times, at, join_parts(faces, looks, notes), digest)
 
 
 def _checked_layers(path: Path) -> tuple[Any, str]:
@@ -231,7 +227,7 @@ def _looks(path: Path, mesh: Any, triangles: np.ndarray, corners: tuple[np.ndarr
     colour, opacity = mesh.GetDisplayColorPrimvar(), mesh.GetDisplayOpacityPrimvar()
     if not colour.HasValue() and not opacity.HasValue():
         return None
-    rgba = np.ones((len(triangles), 4)) * [0.45, 0.45, 0.45, 1]
+    rgba = NO_LOOK.repeat(len(triangles), 0)
     for primvar, first, last in ((colour, 0, 3), (opacity, 3, 4)):
         if primvar.HasValue():
             value = primvar.ComputeFlattened(_earliest(primvar.GetAttr()))
@@ -239,7 +235,7 @@ def _looks(path: Path, mesh: Any, triangles: np.ndarray, corners: tuple[np.ndarr
             rgba[:, first:last] = _per_face(path, primvar, rows, triangles, corners)
     if not np.isfinite(rgba).all():
         raise MeshError(path, f"{mesh.GetPath()}: displayColor: expected finite values, got others")
-    return rgba
+    return rgba.clip(0, 1)
 
 
 def _per_face(

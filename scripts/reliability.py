@@ -1,16 +1,17 @@
-"""Longer versions of the tests of datagen's promises: what a kill at any time, or a changed bit, does to a data set.
+"""Longer versions of the tests of datagen's promises: kills, full disks and changed bits, and what becomes of the data.
 
     python scripts/reliability.py --kills 50 --flips 1000
 
 Each round starts a run of two workers, kills the driver or a worker (SIGKILL) at a random time, looks at what is
-left, and starts the same command again; at the end every byte must be that of a run that was left alone.
+left, and starts the same command again; at the end every byte must be that of a run that was left alone. Runs of
+three workers are broken at each of their steps (fault_points.py). Runs write to disks in memory that are too small for
+them, where this user may mount some, and finish once these have been made larger.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
-import hashlib
 import os
 import random
 import signal
@@ -21,10 +22,12 @@ import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))
+sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
-from datagen import verify_dataset  # noqa: E402  after the path
-from datagen.run_log import LOG_NAME  # noqa: E402
+from fault_points import listed_damage, sums  # noqa: E402  after the path
+
+from datagen import verify_dataset  # noqa: E402
+from datagen.writer import TEMPORARY_PREFIX  # noqa: E402
 
 FIELDS = {
     "count": 12,
@@ -42,6 +45,8 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=10, help="rounds for each way of storage and each victim")
     parser.add_argument("--flips", type=int, default=1000, help="changed bits for each way of storage")
+    parser.add_argument("--frames", type=int, default=6, help="of the runs that are broken at each step")
+    parser.add_argument("--disks", type=int, default=20, help="sizes of small disks for each way of storage")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
     rng = random.Random(chosen.seed)
@@ -62,6 +67,8 @@ def main() -> int:
             missed = sum(not finds_a_flip(whole, rng) for _ in range(chosen.flips))
             print(f"{storage}: {chosen.flips} bits changed, {missed} not found")
             broken += missed
+            broken += fill_disks(Path(name), storage, chosen.disks)
+            broken += break_at_each_step(storage, chosen.frames)
     return min(broken, 1)
 
 
@@ -89,13 +96,66 @@ def kill_and_finish(base: Path, storage: str, victim: str, delay_s: float) -> li
             problems += [f"{len(alive)} processes alive 2 s later"] if alive else []
             while any(Path(f"/proc/{pid}").exists() for pid in alive):
                 time.sleep(0.05)
-        if (out / "run.json").exists() and ((out / "manifest.jsonl").exists() or (out / "shards").exists()):
-            problems += verify_dataset(out)
+        problems += listed_damage(out)
         code = start(out, storage).wait()
         problems += [f"exit code {code}"] if code else []
         found, wanted = sums(out), sums(base / f"{storage}-whole")
         differing = sorted(key for key in {**found, **wanted} if found.get(key) != wanted.get(key))
         return problems + [f"{key} differs" for key in differing]
+
+
+def break_at_each_step(storage: str, frames: int) -> int:
+    """Break runs at each of their steps in all ways, and return how many ways broke a promise."""
+    words = [sys.executable, "scripts/fault_points.py", "--storage", storage, "--count", str(frames)] if frames else []
+    broken = 0
+    for asked in (
+        "--workers 1",
+        "--workers 1 --begun 3",
+        "--workers 3 --victim driver --way kill-before kill-after",
+        "--workers 3 --victim worker --way kill-before kill-after",
+        "--workers 3 --victim worker --way kill-before kill-after --times 5",
+        "--workers 3 --way full full-once",
+    ):
+        if frames:
+            broken += subprocess.run([*words, *asked.split()], cwd=ROOT, check=False).returncode != 0
+    return broken
+
+
+def fill_disks(base: Path, storage: str, count: int) -> int:
+    """Run on disks that are too small, then make them larger; return how many problems there were."""
+    whole, place = base / f"{storage}-whole", base / "disk"
+    place.mkdir(exist_ok=True)
+    needed_kib, wanted, broken, full = (
+        4 * sum(-(-p.stat().st_size // 4096) for p in whole.rglob("*")),
+        sums(whole),
+        0,
+        0,
+    )
+    for k in range(count):
+        size = f"size={max(8, needed_kib * (k + 1) // (count + 1)) // 4 * 4}k"
+        mount = ["mount", "-t", "tmpfs", "-o"]
+        if subprocess.run([*mount, size, "none", str(place)], check=False, stderr=subprocess.DEVNULL).returncode:
+            print(f"{storage}: small disks left out, this user may not mount any")
+            return broken
+        try:
+            out, problems = place / "data", []
+            code = start(out, storage).wait()
+            full += code != 0
+            if code == 0 and sums(out) != wanted:
+                problems.append("exit code 0, but another data set")
+            problems += [f"{path.name} left" for path in place.rglob(f"{TEMPORARY_PREFIX}*")]
+            problems += listed_damage(out)
+            subprocess.run(["mount", "-o", "remount,size=256m", str(place)], check=True)
+            code = start(out, storage).wait()
+            problems += [f"then exit code {code}"] if code else []
+            problems += [] if sums(out) == wanted else ["then another data set"]
+        finally:
+            subprocess.run(["umount", str(place)], check=True)
+        for problem in problems:
+            print(f"{storage}: on a disk of {size}: {problem}")
+        broken += len(problems)
+    print(f"{storage}: {count} small disks, {full} of them too small, {broken} problems", flush=True)
+    return broken
 
 
 def children_of(pid: int) -> list[int]:
@@ -122,12 +182,6 @@ def finds_a_flip(folder: Path, rng: random.Random) -> bool:
     is_found = verify_dataset(folder) != []
     path.write_bytes(data)
     return is_found
-
-
-def sums(folder: Path) -> dict[str, str]:
-    """Return the checksum of every file but the locks and the log of how long runs took."""
-    files = [p for p in sorted(folder.rglob("*")) if p.is_file() and not p.name.startswith((".lock", LOG_NAME))]
-    return {p.relative_to(folder).as_posix(): hashlib.sha256(p.read_bytes()).hexdigest() for p in files}
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from gltf_makers import Maker
 
 import datagen.assets
 from datagen.assets import MeshError, load_mesh
@@ -171,6 +172,18 @@ def test_colours_of_vertices_become_linear_face_colours(tmp_path):
     half = text.replace("1 0 0\nf", "1 0 0\nf").replace(" 1 0 0\n", " 0.5 0.5 0.5\n")
     grey = load_mesh(str(put(tmp_path, "grey.obj", half)))
     assert 0.2 < float(grey.color[0, 1]) < 0.23  # sRGB 0.5 is 0.214 in linear light
+
+
+def test_a_part_without_a_colour_is_grey_and_opaque_beside_one_that_has_one(tmp_path):
+    maker = Maker()
+    maker.tree["materials"] = [{"pbrMetallicRoughness": {"baseColorFactor": [1, 0, 0, 1]}}]
+    for mesh in (maker.mesh(material=0), maker.mesh()):
+        maker.node(mesh=mesh)
+    maker.tree["scenes"] = [{"nodes": [0, 1]}]
+    asset = load_mesh(maker.save(tmp_path / "two.gltf"))
+    torch.testing.assert_close(asset.color[:2], torch.tensor([[1.0, 0, 0]] * 2, dtype=torch.float64))
+    assert 0.4 < float(asset.color[2:].min()) <= float(asset.color[2:].max()) < 0.5
+    assert asset.opacity is None
 
 
 def test_an_animation_that_is_not_read_is_said(tmp_path):

@@ -8,7 +8,7 @@ import time
 from pathlib import Path
 
 import pytest
-from test_datagen_runs import ROOT, command
+from test_datagen_runs import ROOT, children_of, command
 
 import datagen.runs
 from datagen import BlurDataset, DatasetSpec, MeshError, generate, parse_spec
@@ -70,6 +70,33 @@ def test_a_process_that_dies_between_frames_costs_none(workers):
     assert [o.error for o in outcomes] == [""] * 6
     assert killed
     assert len({o.text for o in outcomes}) > workers
+
+
+def task_that_holds_the_interpreter(plan_json, folder, index):
+    (Path(folder) / f"{index}").touch()
+    return str(sum(range(10**12)))  # hours in one call, in which no other thread runs
+
+
+@pytest.mark.skipif(not hasattr(os, "O_ASYNC"), reason="needs signals of pipes")
+def test_a_worker_ends_with_its_driver_even_in_compiled_code(tmp_path):
+    program = (
+        "import sys, test_datagen_commands as t\n"
+        "list(t.run_processes(t.task_that_holds_the_interpreter, '', sys.argv[1], range(2), 2))"
+    )
+    places = os.pathsep.join(map(str, (ROOT, ROOT / "tests", ROOT / "scripts")))
+    driver = subprocess.Popen([sys.executable, "-c", program, tmp_path], env=os.environ | {"PYTHONPATH": places})
+    deadline = time.monotonic() + 120
+    while len(list(tmp_path.iterdir())) < 2 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    workers = children_of(driver.pid)
+    assert len(workers) >= 2
+    driver.kill()
+    driver.wait()
+    time.sleep(2)
+    left = [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+    for pid in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left
 
 
 def test_a_worker_watches_over_its_driver_before_it_imports_torch():

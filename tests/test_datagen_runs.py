@@ -1,7 +1,5 @@
-import functools
 import hashlib
 import json
-import os
 import random
 import shutil
 import signal
@@ -14,7 +12,6 @@ import pytest
 
 import datagen.runs
 from datagen import ManifestError, SpecError, generate, parse_spec, verify_dataset
-from datagen.__main__ import main
 from datagen.entries import read_entries
 from datagen.manifest import MANIFEST_NAME, read_manifest
 from datagen.writer import FOLDERS, TEMPORARY_PREFIX
@@ -243,97 +240,6 @@ def test_a_manifest_of_another_configuration_is_refused_and_left_alone(reference
     assert sums(folder) == before
 
 
-# One process that forks for every kill point: the k-th fsync or rename kills it before, or after, being done.
-KILL_EVERYWHERE = """
-import os, shutil, signal, sys
-import torch
-torch.set_num_threads(1)
-import datagen.runs as runs
-from datagen import generate, parse_spec, verify_dataset
-from datagen.samples import make_sample
-import json, pathlib
-base, fields, begun = pathlib.Path(sys.argv[1]), json.loads(sys.argv[2]), int(sys.argv[3])
-spec = parse_spec(fields)
-made = {}
-def remembered(plan, index):  # rendering is not what is tested here
-    if index not in made:
-        made[index] = make_sample(plan, index)
-    return made[index]
-runs.make_sample = remembered
-generate(spec, base / "whole")
-if begun:
-    generate(parse_spec(fields | {"count": begun}), base / "begun")
-
-def in_child(k, after, out):
-    pid = os.fork()
-    if pid == 0:
-        left = [k]
-        def deadly(real):
-            def call(*a, **kw):
-                left[0] -= 1
-                if left[0] == 0 and not after:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                result = real(*a, **kw)
-                if left[0] == 0:
-                    os.kill(os.getpid(), signal.SIGKILL)
-                return result
-            return call
-        if k:
-            os.fsync, os.replace = deadly(os.fsync), deadly(os.replace)
-        try:
-            generate(spec, out)
-        finally:
-            os._exit(0 if sys.exc_info()[0] is None else 1)
-    return os.waitpid(pid, 0)[1]
-
-k = points = 0
-while True:
-    k += 1
-    killed = 0
-    for after in (False, True):
-        out = base / f"{k}-{after}"
-        if begun:
-            shutil.copytree(base / "begun", out)
-        status = in_child(k, after, out)
-        if os.WIFSIGNALED(status):
-            killed += 1
-            if (out / "run.json").exists() and ((out / "manifest.jsonl").exists() or (out / "shards").exists()):
-                assert verify_dataset(out) == [], (k, after)  # what is listed is whole, right after the kill
-        status = in_child(0, False, out)
-        assert status == 0, (k, after, status)
-    points += killed
-    if not killed:
-        break
-print(points)
-"""
-
-
-SHARDS = {"storage": "shards", "frames_per_shard": 2}
-
-
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork")
-@pytest.mark.parametrize(
-    ("fields", "begun", "fewest"),
-    [
-        ({"count": 2}, 0, 2 * 2 * 10),  # three files of three steps and a line, a frame
-        (SHARDS | {"count": 3}, 0, 2 * 2 * 6),  # two files of three steps, a shard
-        (SHARDS | {"count": 4}, 3, 2 * 8),  # a shard that grows: its marker goes before the tar is replaced
-    ],
-    ids=["folder", "shards", "growing shard"],
-)
-def test_killed_at_every_commit_step_a_rerun_gives_the_same_bytes(tmp_path, fields, begun, fewest):
-    child = run_script(KILL_EVERYWHERE, tmp_path, json.dumps(TINY | fields), begun, stdout=subprocess.PIPE)
-    points = int(child.communicate(timeout=300)[0].splitlines()[-1])
-    assert child.returncode == 0
-    assert points >= fewest
-    whole = sums(tmp_path / "whole")
-    runs = [p for p in tmp_path.iterdir() if p.name not in ("whole", "begun")]
-    assert len(runs) == points + 2
-    for folder in runs:
-        assert sums(folder) == whole, folder.name
-        assert not list(folder.rglob(f"{TEMPORARY_PREFIX}*")), folder.name
-
-
 DRIVE = """
 import sys
 from datagen.__main__ import main
@@ -379,7 +285,7 @@ def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path, storag
     workers = children_of(driver.pid)
     driver.send_signal(signal.SIGKILL)
     driver.wait(timeout=30)
-    deadline = time.monotonic() + 20
+    deadline = time.monotonic() + 2
     while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert workers
@@ -424,41 +330,6 @@ def test_a_folder_with_other_files_is_refused_and_left_alone(tmp_path):
     assert {p.name for p in tmp_path.rglob("*.*")} == {"letter.txt", ".tmp-1-1-mine", "own.exr", ".lock"}
 
 
-@pytest.mark.parametrize("storage", ["folder", "shards"])
-def test_a_full_disk_at_any_write_loses_nothing_and_a_rerun_finishes(tmp_path, monkeypatch, capsys, storage):
-    fields = {"count": 3, "storage": storage, "frames_per_shard": 2}
-    sync = os.fsync
-    monkeypatch.setattr(datagen.runs, "make_sample", functools.cache(datagen.runs.make_sample))
-    generate(spec(**fields), tmp_path / "whole")
-    words = [*command("", count=3, workers=1)[2:], "--storage", storage, "--frames-per-shard", "2"]
-    left = [0]
-
-    def full(descriptor):
-        left[0] -= 1
-        if left[0] == 0:
-            raise OSError(28, "No space left on device")
-        return sync(descriptor)
-
-    steps = codes = 0
-    while left[0] <= 0:  # until a run ends before the disk is full
-        steps += 1
-        left[0] = steps
-        out = tmp_path / f"{steps}"
-        monkeypatch.setattr("os.fsync", full)
-        code = main(["--out", str(out), *words])
-        monkeypatch.setattr("os.fsync", sync)
-        assert code == (1 if left[0] <= 0 else 0), steps
-        assert not list(out.rglob(f"{TEMPORARY_PREFIX}*")), steps
-        if (out / "run.json").exists() and ((out / MANIFEST_NAME).exists() or (out / "shards").exists()):
-            assert verify_dataset(out) == [], steps
-        if code:
-            codes += 1
-            assert "No space left" in capsys.readouterr().err
-        assert main(["--out", str(out), *words]) == 0
-        assert sums(out) == sums(tmp_path / "whole"), steps
-    assert codes >= 10
-
-
 def test_a_path_that_is_a_file_is_refused(tmp_path):
     (tmp_path / "file").write_text("x")
     with pytest.raises(SpecError, match="out: expected a folder"):
@@ -466,13 +337,14 @@ def test_a_path_that_is_a_file_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["folder", "shards"])
-def test_a_damaged_record_of_the_run_is_written_again_where_the_frames_bear_it_out(tmp_path, storage):
+def test_a_damaged_or_missing_record_of_the_run_is_written_again_where_the_frames_bear_it_out(tmp_path, storage):
     fields = {"storage": storage, "frames_per_shard": 2}
     folder = tmp_path / "data"
     generate(spec(**fields), folder)
     whole = sums(folder)
     record = (folder / "run.json").read_bytes()
     damages = (
+        None,
         b"",
         record[:-9],
         record.replace(b'"seed": 4', b'"seed": 5'),
@@ -480,19 +352,25 @@ def test_a_damaged_record_of_the_run_is_written_again_where_the_frames_bear_it_o
     )
     for damaged in damages:
         assert damaged != record
-        (folder / "run.json").write_bytes(damaged)
+        damage(folder / "run.json", damaged)
         assert verify_dataset(folder) != []
         for other in ({"seed": 5}, {"count": 2}):
             with pytest.raises(SpecError):
                 generate(spec(**fields | other), folder)
-            assert (folder / "run.json").read_bytes() == damaged
+            assert damaged == ((folder / "run.json").read_bytes() if (folder / "run.json").exists() else None)
         result = generate(spec(**fields | {"storage": "auto"}), folder)
         assert (result.made, result.kept) == (0, 4)
         assert "run.json" in result.repaired[0]
         assert sums(folder) == whole
         assert verify_dataset(folder) == []
-    (folder / "run.json").write_bytes(b"")
     for place in (*folder.glob("manifest.jsonl"), *folder.glob("shards/*.json")):
         place.unlink()
-    with pytest.raises(SpecError, match=r"run\.json"):  # nothing bears it out
-        generate(spec(**fields), folder)
+    for damaged in (None, b""):
+        damage(folder / "run.json", damaged)
+        with pytest.raises(SpecError, match=r"run\.json"):  # nothing bears it out
+            generate(spec(**fields), folder)
+
+
+def damage(place, data):
+    """Give a file other bytes, or take it away."""
+    place.unlink() if data is None else place.write_bytes(data)

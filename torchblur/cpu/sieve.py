@@ -1,6 +1,6 @@
 """Which pairs of receivers and casters may block a light at all, compiled: most candidates do not.
 
-Before: sides.py.  After: join.py.
+Before: blocking.py.  After: blocked.py.
 Symbols: as in blocking.py; a pair is left out only where the Bernstein coefficients show, on every slice that is looked
 at, that no time has all signs alike.
 Source: ours.

@@ -105,9 +105,8 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5, help="interleaved repetitions that are timed")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    print(
-        f"{arguments.size} px, float32, {platform.machine()}, one thread, torch {torch.__version__}, {arguments.backend}\n"
-    )
+    way = "plain torch" if arguments.backend == "torch" else "compiled where it can be"
+    print(f"{arguments.size} px, float32, {platform.machine()}, one thread, torch {torch.__version__}, {way}\n")
     print("| scene | needs | auto | all | planning |\n|---|---|--:|--:|--:|")
     for name, each in scenes(arguments.size).items():
         make = functools.partial(tb.render, each, backend=arguments.backend)

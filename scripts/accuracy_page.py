@@ -129,12 +129,12 @@ def write_page(folder: Path, results: dict[str, Any]) -> Path:
 
 def verdict(record: dict[str, Any]) -> tuple[float, str]:
     """Return the time of the exact frame over that of the mean of 32, and whether it is the faster one, or why not."""
-    rows, looks = record["methods"], record["looks_per_pixel"]
+    rows, looks, intervals = record["methods"], record["looks_per_pixel"], record["intervals_per_pixel"]
     ratio = rows["exact"]["time_s"] / rows["mean of 32"]["time_s"]
     if ratio < 1:
         return ratio, "faster than 32 sharp images"
-    covered = f"{looks:.1f} looks at surfaces a pixel, each found by solving for its times, against 32"
-    return ratio, f"slower: {covered} compiled ones" if looks < 32 else f"slower: {covered}"
+    work = f"{intervals:.1f} intervals a pixel to solve and to order, and {looks:.1f} looks at surfaces"
+    return ratio, f"slower: {work}, against 32 looks"
 
 
 def _verdicts(scenes: dict[str, Any]) -> str:

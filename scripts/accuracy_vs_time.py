@@ -121,12 +121,14 @@ def errors(image: Tensor, reference: Tensor) -> dict[str, float]:
     return found | ({"psnr_db": float(tb.psnr(image, reference))} if mse else {})
 
 
-def warm_up(scene: tb.Scene) -> None:
-    """Run all that has to be compiled once, on a small scene."""
+def warm_up(scene: tb.Scene, small: tb.Scene) -> None:
+    """Run all that has to be compiled once: what depends on how much there is on the scene itself, else on a small
+    one.
+    """
     tb.render(scene)
-    tb.accumulate(scene, 1)
-    tb.stochastic(scene, 1)
-    tb.render_instant(scene)
+    tb.accumulate(small, 1)
+    tb.stochastic(small, 1)
+    tb.render_instant(small)
 
 
 def measure(scene: tb.Scene, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -135,14 +137,14 @@ def measure(scene: tb.Scene, settings: dict[str, Any]) -> tuple[dict[str, Any], 
     every = methods(tuple(settings["counts"]))
     images: dict[str, Tensor] = {}
     seconds: dict[str, list[float]] = {name: [] for name in every}
-    looks = 0
+    counts: dict[str, int] = {}
     for _ in range(settings["repeats"]):
         for name, (_, make) in every.items():
             start = time.process_time()
             made = make(scene)
             seconds[name].append(time.process_time() - start)
             images[name] = made.rgba[..., :3] if isinstance(made, tb.Frame) else made
-            looks = made.counts["nodes"] if name == "exact" else looks
+            counts = made.counts if name == "exact" else counts
     exact, times = images["exact"], settings["check_times"]
     known = f"mean of {times}"
     check = images[known] if known in images else tb.accumulate(scene, times).rgba[..., :3]
@@ -151,7 +153,8 @@ def measure(scene: tb.Scene, settings: dict[str, Any]) -> tuple[dict[str, Any], 
         for name, (family, _) in every.items()
     }
     record = {"check": errors(exact, check), "check_times": times, "methods": rows}
-    record["looks_per_pixel"] = looks / (scene.camera.width * scene.camera.height)
+    n_pixels = scene.camera.width * scene.camera.height
+    record |= {"looks_per_pixel": counts["nodes"] / n_pixels, "intervals_per_pixel": counts["intervals"] / n_pixels}
     return record | {"cpu_s": time.process_time() - begun}, images
 
 
@@ -188,7 +191,7 @@ def main(argv: list[str] | None = None) -> None:
             continue
         print(f"{k + 1}/{len(names)} {name} ...", file=sys.stderr)
         scene = single(SCENES[name](size))
-        warm_up(single(SCENES[name](16)))
+        warm_up(scene, single(SCENES[name](16)))
         record, images = measure(scene, settings)
         shown = {method: images[method] for method in SHOWN if method in images}
         sheet.write_bytes(accuracy_page.encode_sheet(shown))

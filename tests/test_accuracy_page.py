@@ -44,11 +44,12 @@ def test_every_method_is_measured_on_every_scene(page):
 
 def test_the_verdict_is_that_of_the_times():
     rows = {"exact": {"time_s": 1.0}, "mean of 32": {"time_s": 4.0}}
-    assert accuracy_page.verdict({"methods": rows, "looks_per_pixel": 3.0}) == (0.25, "faster than 32 sharp images")
+    record = {"methods": rows, "looks_per_pixel": 40.0, "intervals_per_pixel": 5.0}
+    assert accuracy_page.verdict(record) == (0.25, "faster than 32 sharp images")
     rows["mean of 32"]["time_s"] = 0.5
-    ratio, text = accuracy_page.verdict({"methods": rows, "looks_per_pixel": 40.0})
+    ratio, text = accuracy_page.verdict(record)
     assert ratio == 2.0
-    assert text.startswith("slower: 40.0 looks")
+    assert text.startswith("slower: 5.0 intervals a pixel to solve and to order, and 40.0 looks at surfaces,")
 
 
 def test_scenes_are_measured_where_they_have_a_compiled_path():

@@ -100,4 +100,4 @@ def announce(function: Callable[..., Any]) -> None:
     """Log a warning if a function was never compiled here, as its first call will then take its time. Source: ours."""
     stored = getattr(getattr(function, "_cache", None), "cache_path", None)
     if not function.signatures and not (stored and any(Path(stored).glob(f"*.{function.__name__}-*.nbi"))):
-        logging.getLogger("torchblur").warning("compiling for the CPU, once: most of a minute")
+        logging.getLogger("torchblur").warning("compiling for the CPU, once: about a minute")

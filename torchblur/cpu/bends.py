@@ -12,11 +12,11 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
-from torchblur.cpu.curves import CONE, LIT, MIPPED, SQUARE, TEXTURED, VARYING, Span, square_of, squares
+from torchblur.cpu.curves import CONE, LIT, MIPPED, SQUARE, TEXTURED, VARYING, Span, dot_of, square_of, squares
 from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import SPOT, Lit
 from torchblur.cpu.layers import Looks
-from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
+from torchblur.cpu.polynomials import MAX_DEGREE, roots_of, sort_few
 from torchblur.cpu.receive import Shade
 from torchblur.light_bends import FLAT
 from torchblur.light_bends import NOISE as LIGHT_NOISE
@@ -24,6 +24,8 @@ from torchblur.texture_bends import NOISE as TEXTURE_NOISE
 
 CHOOSE_2, CHOOSE_6 = np.array([1.0, 2, 1]), np.array([1.0, 6, 15, 20, 15, 6, 1])
 CHOOSE_8 = np.array([1.0, 8, 28, 56, 70, 56, 28, 8, 1])
+
+FEW = 32  # that are sorted by insertion
 
 
 class Bends(NamedTuple):
@@ -70,21 +72,11 @@ def find_bends(span: Span, n_layers: int, scene: tuple[Looks, Lit], shade: Shade
     if count > len(tau):
         return -count
     if count > 2:
-        _sort(tau, count)
+        if count > FEW:
+            tau[:count].sort()
+        else:
+            sort_few(tau, count)
     return count
-
-
-@inlined
-def _sort(tau: np.ndarray, count: int) -> None:
-    if count > 32:
-        tau[:count].sort()
-        return
-    for k in range(1, count):
-        value, place = tau[k], k
-        while place > 0 and tau[place - 1] > value:
-            tau[place] = tau[place - 1]
-            place -= 1
-        tau[place] = value
 
 
 @inlined
@@ -162,23 +154,6 @@ def _largest(vector: np.ndarray) -> float:
 
 
 @inlined
-def _dot(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Write the dot product of vectors of cubics (3, 4) to `out` (7,)."""
-    for k in range(7):
-        out[k] = 0.0
-    for d in range(3):
-        a0, a1, a2, a3 = a[d, 0], 3 * a[d, 1], 3 * a[d, 2], a[d, 3]
-        b0, b1, b2, b3 = b[d, 0], 3 * b[d, 1], 3 * b[d, 2], b[d, 3]
-        out[0] += a0 * b0
-        out[1] += (a0 * b1 + a1 * b0) / 6
-        out[2] += (a0 * b2 + a1 * b1 + a2 * b0) / 15
-        out[3] += (a0 * b3 + a1 * b2 + a2 * b1 + a3 * b0) / 20
-        out[4] += (a1 * b3 + a2 * b2 + a3 * b1) / 15
-        out[5] += (a2 * b3 + a3 * b2) / 6
-        out[6] += a3 * b3
-
-
-@inlined
 def _cross_light(span: Span, m: int, lit: Lit, bends: Bends, count: int) -> int:
     """Add the times at which the surface turns to or from a lamp, or passes the borders of a spot's cone."""
     normal = span.normal[m]
@@ -186,7 +161,7 @@ def _cross_light(span: Span, m: int, lit: Lit, bends: Bends, count: int) -> int:
     for lamp in range(len(lit.kind)):
         vector = span.vector[m, lamp]
         of_vector = _largest(vector)
-        _dot(normal, vector, bends.room[0])
+        dot_of(normal, vector, bends.room[0])
         count = _add_roots(bends, 7, LIGHT_NOISE * of_normal * of_vector, count)
         if lit.kind[lamp] != SPOT:
             continue
@@ -223,7 +198,7 @@ def _cross_cone(span: Span, m: int, lamp: int, cosine: float, to: tuple[Bends, i
             room[k] = half[k]
         return _add_roots(bends, 5, np.sqrt(noise), count)
     rest = span.room[CONE]
-    _dot(vector, vector, rest)
+    dot_of(vector, vector, rest)
     square_of(span.quartic, 1, 1.0, room)
     for k in range(7):
         for j in range(3):

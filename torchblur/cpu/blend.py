@@ -15,7 +15,7 @@ from torchblur.cells import MIN_CELL
 from torchblur.cpu.batch import make_batch
 from torchblur.cpu.coverage import make_work
 from torchblur.cpu.fill import fill_tile
-from torchblur.cpu.jit import borrowed, inner, jit
+from torchblur.cpu.jit import borrowed, inlined, inner, jit
 from torchblur.cpu.sweep import N_NUMBERS, NO_ROOM, PRISM, Cells, Ray, make_cells, make_ray, make_solver, sweep
 from torchblur.cpu.tiles import TILE_PX, Geometry, View, count_ray, gather_ray, make_tile
 
@@ -62,6 +62,18 @@ def integral(colours: Colours, s: int, t: float) -> float:
         into, rise = min(t, end) - start, weight[k + 1] - weight[k]
         total += into * (weight[k] + (0.5 * into * rise / (end - start) if rise != 0 else 0.0))
     return total
+
+
+@inlined
+def write_delays(colours: Colours, view: View, place: tuple[int, int], out: np.ndarray) -> None:
+    """Write by how much the line of a pixel, at column and row, delays each shutter to `out` (S,)."""
+    column, row = place
+    for s in range(len(out)):
+        way = colours.direction[s]
+        line = row if way == DOWN else view.height - 1 - row if way == UP else column
+        if way > RIGHT:
+            line = view.width - 1 - column
+        out[s] = colours.delay[s] * line
 
 
 @inner
@@ -242,12 +254,7 @@ def see_tiles(
             if mode != COMPOSITE:
                 listed = _list(listed, ray, n, (cells, n_cells), row * view.width + column)
                 continue
-            for s in range(n_shutters):
-                way = colours.direction[s]
-                line = row if way == DOWN else view.height - 1 - row if way == UP else column
-                if way > RIGHT:
-                    line = view.width - 1 - column
-                delays[0, s] = colours.delay[s] * line
+            write_delays(colours, view, (column, row), delays[0])
             _composite(
                 colours, borrowed(ray), (borrowed(cells), n_cells), borrowed((delays, seen)), (image, row, column)
             )

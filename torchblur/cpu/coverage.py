@@ -14,7 +14,7 @@ import numpy as np
 
 from torchblur.bernstein import MAX_HALVINGS
 from torchblur.cpu.jit import inner
-from torchblur.cpu.polynomials import MAX_DEGREE, roots_of
+from torchblur.cpu.polynomials import MAX_DEGREE, roots_of, sort_few
 from torchblur.edges import CLIP_NOISE, FIRST, SECOND
 
 MAX_CUTS = 14  # 0, 1, two roots of each edge and three of each clip plane
@@ -252,12 +252,7 @@ def find_pieces(work: Work, is_clipped: bool, is_still: bool, allowed: int) -> i
                 n_cuts += 1
     if is_clipped:
         n_cuts = _plane_roots(work, False, _plane_roots(work, True, n_cuts))
-    for k in range(1, n_cuts):
-        value, place = cut[k], k
-        while place > 0 and cut[place - 1] > value:
-            cut[place] = cut[place - 1]
-            place -= 1
-        cut[place] = value
+    sort_few(cut, n_cuts)
     count, before = 0, 0
     for k in range(n_cuts - 1):
         start, end = cut[k], cut[k + 1]

@@ -226,6 +226,23 @@ def square_of(rows: np.ndarray, n: int, share: float, out: np.ndarray) -> None:
 
 
 @inlined
+def dot_of(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    """Write the dot product of vectors of cubics (3, 4) to `out` (7,)."""
+    for k in range(7):
+        out[k] = 0.0
+    for d in range(3):
+        a0, a1, a2, a3 = a[d, 0], 3 * a[d, 1], 3 * a[d, 2], a[d, 3]
+        b0, b1, b2, b3 = b[d, 0], 3 * b[d, 1], 3 * b[d, 2], b[d, 3]
+        out[0] += a0 * b0
+        out[1] += (a0 * b1 + a1 * b0) / 6
+        out[2] += (a0 * b2 + a1 * b1 + a2 * b0) / 15
+        out[3] += (a0 * b3 + a1 * b2 + a2 * b1 + a3 * b0) / 20
+        out[4] += (a1 * b3 + a2 * b2 + a3 * b1) / 15
+        out[5] += (a2 * b3 + a3 * b2) / 6
+        out[6] += a3 * b3
+
+
+@inlined
 def squares(span: Span, m: int) -> None:
     """Write S^4 times the square of a footprint, and S^4, to the rows SQUARE and SQUARE + 1 of the room."""
     square, fourth, quartic = span.room[SQUARE], span.room[SQUARE + 1], span.quartic

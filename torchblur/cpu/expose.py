@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from torchblur.cpu.bends import find_bends, make_bends
-from torchblur.cpu.blend import DOWN, N_LOOKS, RIGHT, UP, Colours, Listed
+from torchblur.cpu.blend import N_LOOKS, Colours, Listed, write_delays
 from torchblur.cpu.curves import LIT, VARYING, Stock, follow, make_span
 from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.lambert import Lit
@@ -64,7 +64,7 @@ def expose(
         borrowed(shades[0]),
         borrowed(shades[1]),
     )
-    n_lamps, n_shutters = len(lit.kind), len(colours.delay)
+    n_lamps = len(lit.kind)
     number, still_number, is_collecting = begin
     moving, resting = make_received(FIRST_ROOM, n_lamps), make_received(FIRST_ROOM, n_lamps)
     span, panel, bends = make_span(8, n_lamps), make_panel(8, n_lamps), make_bends(FIRST_ROOM)
@@ -75,12 +75,7 @@ def expose(
         row, column = pixel // view.width, pixel % view.width
         x_ndc = 2 * (column + view.x_px) / view.width - 1
         y_ndc = 1 - 2 * (row + view.y_px) / view.height
-        for s in range(n_shutters):
-            way = colours.direction[s]
-            line = row if way == DOWN else view.height - 1 - row if way == UP else column
-            if way > RIGHT:
-                line = view.width - 1 - column
-            room.shutter[DELAY, s] = colours.delay[s] * line
+        write_delays(colours, view, (column, row), room.shutter[DELAY])
         for k in range(cell, cell + n_cells):
             n_layers = listed.n_layers[k]
             if n_layers > len(span.face):

@@ -59,6 +59,17 @@ def sort_by(key: np.ndarray, column: int, order: np.ndarray, n: int) -> None:
 
 
 @inlined
+def sort_few(values: np.ndarray, n: int) -> None:
+    """Put the first `n` values in ascending order, by insertion."""
+    for k in range(1, n):
+        value, place = values[k], k
+        while place > 0 and values[place - 1] > value:
+            values[place] = values[place - 1]
+            place -= 1
+        values[place] = value
+
+
+@inlined
 def signs_of(c: np.ndarray, row: int, n: int, noise: float) -> tuple[int, int, int]:
     """Return how often the sign changes along `n` coefficients, and the first and the last sign; noise counts as 0."""
     changes, first, last = 0, 0, 0

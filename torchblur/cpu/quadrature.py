@@ -28,13 +28,13 @@ NODE, SHARE = np.zeros((2, COUNTS[-1] + 1, COUNTS[-1]))  # on [-1, 1], and weigh
 for _n in range(1, COUNTS[-1] + 1):
     NODE[_n, :_n], SHARE[_n, :_n] = np.polynomial.legendre.leggauss(_n)
 SHARE *= 0.5
-DELAY, AREA, BEFORE, WEIGHT, LEVEL, RISE, N_ROWS = 0, 1, 2, 3, 4, 5, 6  # of what is kept of each shutter
+DELAY, AREA, WEIGHT, LEVEL, RISE, N_ROWS = 0, 1, 2, 3, 4, 5  # of what is kept of each shutter
 
 
 class Room(NamedTuple):
     """What the rays of a thread work in."""
 
-    shutter: np.ndarray  # (N_ROWS, S): delay of the line, area of the weights, their integral before, weight of a
+    shutter: np.ndarray  # (N_ROWS, S): delay of the line, area of the weights, weight of a
     #                      sample; and over a span the weight at its start and the rise to its end
     ends: np.ndarray  # (most spans + 1,) shares of the cell at which its spans end
     stack: np.ndarray  # (MAX_HALVINGS + 2, 3) panels yet to be done: start, end, halvings

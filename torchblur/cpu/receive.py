@@ -16,13 +16,11 @@ import torch
 from torch import Tensor
 
 from torchblur.blocking import Receivers
-from torchblur.cpu.curves import VARYING, Span
+from torchblur.cpu.curves import SQUARE, VARYING, Span, dot_of
 from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import DIRECTIONAL, Lit
 from torchblur.shadows import NOTHING, Shadows
 from torchblur.surfaces import Surfaces
-
-FIRST_ROOM = 256
 
 
 class Received(NamedTuple):
@@ -99,22 +97,11 @@ def receive(span: Span, m: int, lit: Lit, times: tuple[float, float], received: 
     for lamp in range(len(lit.kind)):
         vector = span.vector[m, lamp]
         side = span.side[m, 1 if lit.kind[lamp] == DIRECTIONAL else 0]
-        received.due[n, lamp] = _is_toward(normal, vector, side)
-
-
-@inlined
-def _is_toward(normal: np.ndarray, vector: np.ndarray, side: float) -> bool:
-    """Return whether the product of cubic vectors (3, 4) may be above 0, to the sign of `side`."""
-    c0, c1, c2, c3, c4, c5, c6 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    for d in range(3):
-        a0, a1, a2, a3 = normal[d, 0], 3 * normal[d, 1], 3 * normal[d, 2], normal[d, 3]
-        b0, b1, b2, b3 = vector[d, 0], 3 * vector[d, 1], 3 * vector[d, 2], vector[d, 3]
-        c0, c6 = c0 + a0 * b0, c6 + a3 * b3
-        c1, c5 = c1 + a0 * b1 + a1 * b0, c5 + a2 * b3 + a3 * b2
-        c2, c4 = c2 + a0 * b2 + a1 * b1 + a2 * b0, c4 + a1 * b3 + a2 * b2 + a3 * b1
-        c3 += a0 * b3 + a1 * b2 + a2 * b1 + a3 * b0
-    largest = max(max(max(side * c0, side * c1), max(side * c2, side * c3)), max(max(side * c4, side * c5), side * c6))
-    return largest > 0
+        cosine, is_due = span.room[SQUARE], False
+        dot_of(normal, vector, cosine)
+        for k in range(7):
+            is_due |= side * cosine[k] > 0
+        received.due[n, lamp] = is_due
 
 
 @inlined

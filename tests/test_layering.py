@@ -86,6 +86,7 @@ TORCHBLUR = [
     "cpu.receive",
     "cpu.bends",
     "cpu.panels",
+    "cpu.settle",
     "cpu.shine",
     "cpu.quadrature",
     "cpu.expose",

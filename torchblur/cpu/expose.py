@@ -19,8 +19,9 @@ from torchblur.cpu.jit import borrowed, inlined, jit
 from torchblur.cpu.lambert import Lit
 from torchblur.cpu.layers import Looks
 from torchblur.cpu.panels import make_panel
-from torchblur.cpu.quadrature import DELAY, Room, add_flat, add_varying, make_room
+from torchblur.cpu.quadrature import DELAY, Room, add_still, add_varying, make_room
 from torchblur.cpu.receive import Received, Shade, make_received, receive, with_room
+from torchblur.cpu.settle import receive_still, settle
 from torchblur.cpu.tiles import View
 from torchblur.sort import SAME_TIME
 
@@ -68,6 +69,7 @@ def expose(
     number, still_number, is_collecting = begin
     moving, resting = make_received(FIRST_ROOM, n_lamps), make_received(FIRST_ROOM, n_lamps)
     span, panel, bends = make_span(8, n_lamps), make_panel(8, n_lamps), make_bends(FIRST_ROOM)
+    still = make_panel(8, n_lamps)  # of what rests: its higher powers stay 0
     room = make_room(colours, len(knots), image.shape[3] - N_LOOKS)
     interval, cell, layer = 0, 0, 0
     for p in range(listed.size[0]):
@@ -80,12 +82,30 @@ def expose(
             n_layers = listed.n_layers[k]
             if n_layers > len(span.face):
                 span, panel = make_span(2 * n_layers, n_lamps), make_panel(2 * n_layers, n_lamps)
+                still = make_panel(2 * n_layers, n_lamps)
             t_start, t_end = listed.t[k, 0], listed.t[k, 1]
             varies = False
             for m in range(n_layers):
                 prism = listed.prism[interval + listed.layer[layer + m]]
                 varies |= stock.flags[stock.face[prism]] & VARYING != 0
-            n_spans = _cut(colours, knots, (t_start, t_end), borrowed(room)) if varies else 1
+            if not varies:
+                middle = 0.5 * (t_start + t_end)
+                for m in range(n_layers):
+                    prism = listed.prism[interval + listed.layer[layer + m]]
+                    settle(stock, (looks, lit), borrowed(span), borrowed(still), (m, prism, x_ndc, y_ndc, middle))
+                    if span.flags[m] & LIT:
+                        span.receiver[m] = still_number
+                        still_number += 1
+                        if is_collecting:
+                            resting = with_room(resting)
+                            receive_still(borrowed(span), borrowed(still), (m, middle), lit, borrowed(resting))
+                if not is_collecting:
+                    when = t_start, t_end, borrowed(room)
+                    what, out = borrowed((span, still)), image[row, column]
+                    add_still(what, n_layers, (looks, lit, still_shade, colours), when, out)
+                layer += n_layers
+                continue
+            n_spans = _cut(colours, knots, (t_start, t_end), borrowed(room))
             for part in range(n_spans):
                 start, end = t_start, t_end
                 if n_spans > 1:
@@ -98,26 +118,21 @@ def expose(
                     follow(stock, looks, lit, borrowed(span), (m, prism, x_ndc, y_ndc, start, end))
                     if not span.flags[m] & LIT:
                         continue
-                    span.receiver[m] = number if varies else still_number
-                    number, still_number = number + varies, still_number + (not varies)
-                    if is_collecting and varies:
+                    span.receiver[m] = number
+                    number += 1
+                    if is_collecting:
                         moving = with_room(moving)
                         receive(borrowed(span), m, lit, (start, end), borrowed(moving))
-                    elif is_collecting:
-                        resting, middle = with_room(resting), 0.5 * (start + end)
-                        receive(borrowed(span), m, lit, (middle, middle), borrowed(resting))
                 if is_collecting:
-                    continue
-                out = image[row, column]
-                what, when = borrowed((span, panel)), (start, end, borrowed(room))
-                if not varies:
-                    add_flat(what, n_layers, (looks, lit, still_shade, colours), when, out)
                     continue
                 n = find_bends(borrowed(span), n_layers, (looks, lit), shade, borrowed(bends))
                 if n < 0:
                     bends = make_bends(-2 * n)
                     n = find_bends(borrowed(span), n_layers, (looks, lit), shade, borrowed(bends))
-                add_varying(what, (n_layers, n, borrowed(bends)), (looks, lit, shade, colours), when, out)
+                what, when = borrowed((span, panel)), (start, end, borrowed(room))
+                add_varying(
+                    what, (n_layers, n, borrowed(bends)), (looks, lit, shade, colours), when, image[row, column]
+                )
             layer += n_layers
         interval, cell = interval + n_intervals, cell + n_cells
     return room.count[0], moving, resting

@@ -62,7 +62,7 @@ def make_panel(n_layers: int, n_lamps: int) -> Panel:
 @inlined
 def expand(span: Span, n_layers: int, scene: tuple[Lit, Shade], part: tuple[float, float], panel: Panel) -> None:
     """Write the curves of a part of the span, given by its middle and half length, and the light that reaches it."""
-    lit, shade = scene
+    lit, _ = scene
     middle, half = part
     for m in range(n_layers):
         flags = span.flags[m]
@@ -78,12 +78,22 @@ def expand(span: Span, n_layers: int, scene: tuple[Lit, Shade], part: tuple[floa
             _cubics(span.normal[m], middle, half, panel.normal[m])
             for lamp in range(len(lit.kind)):
                 _cubics(span.vector[m, lamp], middle, half, panel.vector[m, lamp])
-                panel.visible[m, lamp] = visible_at(shade, lamp, span.receiver[m], middle)
                 if lit.kind[lamp] == SPOT:
                     for d in range(3):
                         change = span.axis[lamp, d, 1] - span.axis[lamp, d, 0]
                         panel.axis[lamp, 0, d] = span.axis[lamp, d, 0] + middle * change
                         panel.axis[lamp, 1, d] = half * change
+    reach(span, n_layers, scene, middle, panel)
+
+
+@inlined
+def reach(span: Span, n_layers: int, scene: tuple[Lit, Shade], tau: float, panel: Panel) -> None:
+    """Write the light that reaches the layers of a span at a share of its time."""
+    lit, shade = scene
+    for m in range(n_layers):
+        if span.flags[m] & LIT:
+            for lamp in range(len(lit.kind)):
+                panel.visible[m, lamp] = visible_at(shade, lamp, span.receiver[m], tau)
 
 
 @inlined

@@ -18,7 +18,7 @@ from torchblur.cpu.curves import LIT, MIPPED, MULTIPLIES, TEXTURED, Span
 from torchblur.cpu.jit import inlined, inner
 from torchblur.cpu.lambert import Lit
 from torchblur.cpu.layers import Looks
-from torchblur.cpu.panels import Panel, count_nodes, expand
+from torchblur.cpu.panels import Panel, count_nodes, expand, reach
 from torchblur.cpu.receive import Shade
 from torchblur.cpu.shine import level_at, look_at, place_at
 from torchblur.nodes import COUNTS, FREE_HALVINGS, MANY, MAX_HALVINGS
@@ -63,7 +63,7 @@ def make_room(colours: Colours, n_knots: int, n_meshes: int) -> Room:
 
 
 @inlined
-def add_flat(
+def add_still(
     what: tuple[Span, Panel],
     n_layers: int,
     scene: tuple[Looks, Lit, Shade, Colours],
@@ -78,7 +78,7 @@ def add_flat(
         delay = shutter[DELAY, s]
         whole = integral(colours, s, end - delay) - integral(colours, s, start - delay)
         shutter[WEIGHT, s] = whole / shutter[AREA, s]
-    expand(what[0], n_layers, (lit, shade), (0.5, 0.5), what[1])
+    reach(what[0], n_layers, (lit, shade), 0.5, what[1])
     _add_sample(what, n_layers, (looks, lit, colours.cutoff), (0.0, room), out)
 
 

@@ -48,7 +48,7 @@ class Shade(NamedTuple):
 @inner
 def make_received(n: int, n_lamps: int) -> Received:
     """Return room for so many receivers under so many lamps."""
-    numbers = np.empty((n, 4, 3)), np.ones((n, 3)), np.empty((n, 2))
+    numbers = np.empty((n, 4, 3)), np.empty((n, 3)), np.empty((n, 2))
     return Received(
         *numbers, np.empty(n, np.int64), np.empty(n, np.bool_), np.empty((n, n_lamps), np.bool_), np.zeros(1, np.int64)
     )
@@ -61,13 +61,19 @@ def with_room(received: Received) -> Received:
     if n < len(received.face):
         return received
     more = make_received(2 * n, received.due.shape[1])
-    more.place[:n], more.scale[:n], more.t[:n], more.face[:n] = (
-        received.place,
-        received.scale,
-        received.t,
-        received.face,
-    )
-    more.rests[:n], more.due[:n] = received.rests, received.due
+    for i in range(n):  # slices take seconds to compile
+        more.face[i], more.rests[i], more.t[i, 0], more.t[i, 1] = (
+            received.face[i],
+            received.rests[i],
+            received.t[i, 0],
+            received.t[i, 1],
+        )
+        for d in range(3):
+            more.scale[i, d] = received.scale[i, d]
+            for k in range(4):
+                more.place[i, k, d] = received.place[i, k, d]
+        for lamp in range(received.due.shape[1]):
+            more.due[i, lamp] = received.due[i, lamp]
     more.count[0] = n
     return more
 

@@ -136,7 +136,10 @@ def with_room(tile: Tile, n: int) -> Tile:
         return tile
     most = max(2 * len(tile.prism), have + n)
     data, prism, following = np.empty((most, N_NUMBERS)), np.empty(most, np.int64), np.empty(most, np.int64)
-    data[:have], prism[:have], following[:have] = tile.data[:have], tile.prism[:have], tile.next[:have]
+    for i in range(have):  # slices take seconds to compile
+        prism[i], following[i] = tile.prism[i], tile.next[i]
+        for c in range(N_NUMBERS):
+            data[i, c] = tile.data[i, c]
     return Tile(tile.place, data, prism, following, tile.last, tile.cover, tile.least, tile.run, tile.counts)
 
 

@@ -35,7 +35,9 @@ REPEATS = 5
 MOST_PIXELS_IN_TORCH = 1920 * 1080
 
 
-def best(function: Callable[[], Any], repeats: int = REPEATS, clock: Callable[[], float] = time.perf_counter) -> Any:
+def best(
+    function: Callable[[], Any], repeats: int = REPEATS, clock: Callable[[], float] = time.perf_counter
+) -> tuple[float, Any]:
     """Return the least time of some calls by a clock [s], and the last result."""
     times, result = [], None
     for _ in range(repeats):

@@ -25,6 +25,7 @@ ROOT = Path(__file__).resolve().parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "scripts")]
 
 from fault_points import listed_damage, sums  # noqa: E402  after the path
+from processes import children_of, outlivers  # noqa: E402
 
 from datagen import verify_dataset  # noqa: E402
 from datagen.writer import TEMPORARY_PREFIX  # noqa: E402
@@ -91,11 +92,9 @@ def kill_and_finish(base: Path, storage: str, victim: str, delay_s: float) -> li
             os.kill(target, signal.SIGKILL)
         run.wait(timeout=300)
         if target == run.pid:
-            time.sleep(2)
-            alive = [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+            alive = outlivers(workers)
             problems += [f"{len(alive)} processes alive 2 s later"] if alive else []
-            while any(Path(f"/proc/{pid}").exists() for pid in alive):
-                time.sleep(0.05)
+            outlivers(alive, seconds=float("inf"))
         problems += listed_damage(out)
         code = start(out, storage).wait()
         problems += [f"exit code {code}"] if code else []
@@ -156,19 +155,6 @@ def fill_disks(base: Path, storage: str, count: int) -> int:
         broken += len(problems)
     print(f"{storage}: {count} small disks, {full} of them too small, {broken} problems", flush=True)
     return broken
-
-
-def children_of(pid: int) -> list[int]:
-    """Return the living processes whose parent is `pid`."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid and fields[0] != "Z":
-            found.append(int(stat.parent.name))
-    return found
 
 
 def finds_a_flip(folder: Path, rng: random.Random) -> bool:

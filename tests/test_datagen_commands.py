@@ -8,7 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-from test_datagen_runs import ROOT, children_of, command
+from processes import children_of, outlivers
+from test_datagen_runs import ROOT, command
 
 import datagen.runs
 from datagen import BlurDataset, DatasetSpec, MeshError, generate, parse_spec
@@ -92,8 +93,7 @@ def test_a_worker_ends_with_its_driver_even_in_compiled_code(tmp_path):
     assert len(workers) >= 2
     driver.kill()
     driver.wait()
-    time.sleep(2)
-    left = [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+    left = outlivers(workers)
     for pid in left:
         os.kill(pid, signal.SIGKILL)
     assert not left

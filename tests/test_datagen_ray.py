@@ -7,6 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import is_running, state_and_parent
 from test_datagen_runs import spec, sums
 
 from datagen import SpecError, generate
@@ -37,16 +38,15 @@ def ray_processes(driver, name):
     """The living processes of that name below a driver, by number."""
     found, parents = [], {driver}
     for _ in range(3):  # driver, raylet, workers
-        for stat in Path("/proc").glob("[0-9]*/stat"):
+        for place in Path("/proc").glob("[0-9]*"):
             try:
-                _, after = stat.read_text().rsplit(")", 1)
-                title = (stat.parent / "cmdline").read_text()
+                title = (place / "cmdline").read_text()
             except OSError:
                 continue
-            if int(after.split()[1]) in parents:
-                parents.add(int(stat.parent.name))
+            if state_and_parent(int(place.name))[1] in parents:
+                parents.add(int(place.name))
                 if title.startswith(name):
-                    found.append(int(stat.parent.name))
+                    found.append(int(place.name))
     return sorted(set(found)), parents
 
 
@@ -58,13 +58,6 @@ def wait_for(condition, seconds=120):
             return found
         time.sleep(0.02)
     raise AssertionError("waited in vain")
-
-
-def is_alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def listeners(pids):
@@ -99,7 +92,7 @@ def test_killed_workers_and_drivers_lose_nothing_and_nothing_listens_to_others(t
         run.kill()
         run.wait()
     time.sleep(2)
-    assert [pid for pid in family if is_alive(pid)] == []
+    assert [pid for pid in family if is_running(pid)] == []
     shorter = run_ray(tmp_path / "ray", "--count", "16", **quiet)
     assert shorter.wait(timeout=300) == 0
     mine, whole = sums(tmp_path / "ray"), sums(tmp_path / "one")

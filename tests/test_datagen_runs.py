@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import children_of, outlivers
 
 import datagen.runs
 from datagen import ManifestError, SpecError, generate, parse_spec, verify_dataset
@@ -253,19 +254,6 @@ def command(folder, count=6, workers=2):
     return words
 
 
-def children_of(pid):
-    """The processes whose parent is `pid`, from /proc."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = stat.read_text().rsplit(")", 1)[1].split()
-        except OSError:
-            continue
-        if int(fields[1]) == pid and fields[0] != "Z":
-            found.append(int(stat.parent.name))
-    return found
-
-
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs /proc")
 @pytest.mark.parametrize("storage", ["folder", "shards"])
 def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path, storage):
@@ -285,11 +273,8 @@ def test_a_killed_driver_leaves_no_process_and_a_rerun_finishes(tmp_path, storag
     workers = children_of(driver.pid)
     driver.send_signal(signal.SIGKILL)
     driver.wait(timeout=30)
-    deadline = time.monotonic() + 2
-    while any(Path(f"/proc/{pid}").exists() for pid in workers) and time.monotonic() < deadline:
-        time.sleep(0.05)
     assert workers
-    assert not [pid for pid in workers if Path(f"/proc/{pid}").exists()]
+    assert not outlivers(workers)
     listed = read_entries(folder)
     assert verify_dataset(folder) == []
     result = generate(spec(**fields), folder)

@@ -60,9 +60,8 @@ def make_panel(n_layers: int, n_lamps: int) -> Panel:
 
 
 @inlined
-def expand(span: Span, n_layers: int, scene: tuple[Lit, Shade], part: tuple[float, float], panel: Panel) -> None:
-    """Write the curves of a part of the span, given by its middle and half length, and the light that reaches it."""
-    lit, _ = scene
+def expand(span: Span, n_layers: int, lit: Lit, part: tuple[float, float], panel: Panel) -> None:
+    """Write the curves of a part of the span, given by its middle and half length."""
     middle, half = part
     for m in range(n_layers):
         flags = span.flags[m]
@@ -83,7 +82,6 @@ def expand(span: Span, n_layers: int, scene: tuple[Lit, Shade], part: tuple[floa
                         change = span.axis[lamp, d, 1] - span.axis[lamp, d, 0]
                         panel.axis[lamp, 0, d] = span.axis[lamp, d, 0] + middle * change
                         panel.axis[lamp, 1, d] = half * change
-    reach(span, n_layers, scene, middle, panel)
 
 
 @inlined

@@ -162,7 +162,8 @@ def add_varying(
             top -= 1
             a, b, halvings = stack[top, 0], stack[top, 1], stack[top, 2]
             middle, half = 0.5 * (a + b), 0.5 * (b - a)
-            expand(span, n_layers, (lit, shade), (middle, half), panel)
+            expand(span, n_layers, lit, (middle, half), panel)
+            reach(span, n_layers, (lit, shade), middle, panel)
             n, room.count[2] = count_nodes(span, n_layers, (looks, lit), panel, (is_even, room.count[2]))
             if n == 0:
                 if halvings >= FREE_HALVINGS:

@@ -2,14 +2,14 @@
 
 Before: panels.py, receive.py.  After: expose.py.
 Symbols as in curves.py, at one instant: S the sum of the edge functions e_i, P = S place.
-Source: as curves.py, of which this is the constant term, at a tenth of the arithmetic.
+Source: as curves.py, of which this is the constant term.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from torchblur.cpu.curves import ACROSS, CORNER, EDGE, LIT, MIPPED, TEXTURED, VARYING, Span, Stock
+from torchblur.cpu.curves import ACROSS, CORNER, EDGE, LIT, MIPPED, TEXTURED, Span, Stock
 from torchblur.cpu.jit import inlined
 from torchblur.cpu.lambert import DIRECTIONAL, SPOT, Lit, along
 from torchblur.cpu.layers import Looks
@@ -35,7 +35,7 @@ def settle(
     m, prism, x_ndc, y_ndc, t = what
     looks, lit = scene
     face = stock.face[prism]
-    flags = stock.flags[face] & ~VARYING
+    flags = stock.flags[face]
     span.face[m], span.flags[m] = face, flags
     if not flags & (TEXTURED | LIT):
         return
@@ -92,7 +92,7 @@ def _settle_light(stock: Stock, lit: Lit, span: Span, panel: Panel, layer: tuple
     """
     m, prism, u, t = layer
     e, place, normal, scale = span.room[EDGE], span.place, panel.normal, panel.scale[m, 0]
-    sign = 1.0 if scale > 0 else -1.0 if scale < 0 else 0.0
+    sign = np.sign(scale)
     is_smooth = stock.is_smooth[span.face[m]]
     side = lit.handedness * (stock.parity[prism] if is_smooth else 1.0)
     span.side[m, 0] = side * (sign if is_smooth else 1.0)

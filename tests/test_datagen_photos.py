@@ -1,6 +1,7 @@
 import hashlib
 import io
 import json
+import os
 import random
 import shutil
 from dataclasses import replace
@@ -111,6 +112,17 @@ def test_bad_pictures_are_refused_by_name_and_the_others_used(tmp_path, pictures
     told = capsys.readouterr().err
     assert all(f"refused backgrounds/{name}: " in told for name in wanted)
     assert len(BlurDataset(tmp_path / "data")) == 3
+
+
+def test_a_name_that_is_no_text_is_refused_and_told_as_text(tmp_path):
+    save(tmp_path / "good.png", noise(4, 4))
+    try:
+        shutil.copy(tmp_path / "good.png", tmp_path / os.fsdecode(b"bad\xff.png"))
+    except OSError:
+        pytest.skip("NOT TESTED: this file system takes only names that are text")
+    roster = survey_photos(tmp_path)
+    assert roster.names == ("good.png",)
+    assert roster.refused == (("bad\\xff.png", "expected a file name in UTF-8"),)
 
 
 def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, monkeypatch):

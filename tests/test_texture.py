@@ -226,3 +226,14 @@ def test_gradients_reach_texture_uv_vertices_and_colour(alpha):
 def test_bad_textures_are_refused_by_name(make, name):
     with pytest.raises((TypeError, ValueError), match=rf"^{name}: expected .*, got "):
         make()
+
+
+def test_places_so_far_away_that_the_next_line_of_texels_is_the_same_one():
+    far = torch.full_like(UV, 1e17)  # texels there are further apart than 1
+    moved = torch.stack([SQUARE, SQUARE + torch.tensor([0.3, 0.2, 0.0])])
+    mesh = tb.Mesh(moved, FACES, tb.Material(texture=image(4, 4, 3), wrap="repeat"), uv=far)
+    scene = tb.Scene([mesh], flat_camera(3))
+    for backend in ("cpu", "torch"):
+        rgba = tb.render(scene, backend=backend).rgba  # which texels these are is rounding; that it ends is not
+        assert rgba.isfinite().all()
+        assert rgba[1, 1, 3] > 0.99

@@ -109,8 +109,9 @@ def _cross_lines(span: Span, m: int, looks: Looks, tau: np.ndarray, count: int) 
             if is_proper:
                 r0, r1, r2 = p0 / s0, p1 / s1, p2 / s2
                 low, high = max(low, min(r0, r1, r2)), min(high, max(r0, r1, r2))
-            line = np.ceil(low)
-            while line <= high:
+            first = np.ceil(low)
+            for k in range(int(high - first) + 1 if first <= high else 0):  # of huge ones the next may be the same
+                line = first + k
                 c0, c1, c2 = p0 - line * s0, p1 - line * s1, p2 - line * s2
                 h, bend = c1 - c0, c0 - 2 * c1 + c2
                 square = h * h - bend * c0
@@ -118,7 +119,6 @@ def _cross_lines(span: Span, m: int, looks: Looks, tau: np.ndarray, count: int) 
                     q = -(h + np.copysign(np.sqrt(square), h))
                     count = _add(tau, count, q / bend)
                     count = _add(tau, count, c0 / q)
-                line += 1.0
     return count
 
 

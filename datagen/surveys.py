@@ -42,8 +42,8 @@ def survey_folder(folder: str | Path, kind: Kind, content: Callable[[Path], byte
     names, refused, digest = [], [], hashlib.sha256()
     for name in files_under(folder):
         suffix = Path(name).suffix.lower()
-        if suffix in kind.read + kind.unread and not _is_utf8(name):  # neither a page nor a record could hold it
-            told = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        told = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
+        if suffix in kind.read + kind.unread and told != name:  # neither a page nor a record could hold it
             refused.append((told, "expected a file name in UTF-8"))
             continue
         if suffix in kind.unread:
@@ -61,12 +61,3 @@ def survey_folder(folder: str | Path, kind: Kind, content: Callable[[Path], byte
         found = "; ".join(f"{n}: {r}" for n, r in refused) or f"no {kind.name} file at all"
         raise kind.error(folder, f"expected at least one usable {kind.name} file, got {found}")
     return Roster(tuple(names), tuple(refused), digest.hexdigest())
-
-
-def _is_utf8(name: str) -> bool:
-    """Return whether a file's name can be written as text."""
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True

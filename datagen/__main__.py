@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any, Literal
 
 import tyro
 
-from datagen.commands import COMMANDS, EXIT_DONE, EXIT_USAGE, make_dataset, run_command, tell_usage
+from datagen.commands import COMMANDS, EXIT_DONE, EXIT_INTERRUPTED, EXIT_USAGE, make_dataset, run_command, tell_usage
 from datagen.spec import SpecError, parse_spec, read_spec_fields
 
 PROGRAM = "python -m datagen"
@@ -105,7 +105,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Source: ours.
     """
-    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        return _run_words(list(sys.argv[1:] if argv is None else argv))
+    except KeyboardInterrupt:
+        print("interrupted; the same command finishes the rest", file=sys.stderr)
+        return EXIT_INTERRUPTED
+
+
+def _run_words(words: list[str]) -> int:
+    """Run the command that the words ask for and return the exit code."""
     name = words[0] if words and not words[0].startswith("-") else "generate"
     if name in COMMANDS:
         try:
@@ -118,14 +126,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return tell_usage([f"command: expected one of generate, {', '.join(COMMANDS)}, got {name!r}"])
     words = words[words[:1] == ["generate"] :]
     try:
-        arguments = tyro.cli(
-            tyro.conf.configure(tyro.conf.FlagConversionOff)(Arguments),
-            prog=PROGRAM,
-            args=words,
-            default=_defaults(words),
-        )
-        chosen = {f.name: getattr(arguments, f.name) for f in fields(arguments) if f.name not in NOT_IN_THE_SPEC}
-        spec = parse_spec(chosen)
+        arguments = tyro.cli(tyro.conf.configure(tyro.conf.FlagConversionOff)(Arguments), prog=PROGRAM, args=words)
+        given = {} if arguments.config is None else read_spec_fields(arguments.config)
+        spec = parse_spec(given | _fields_given(words, arguments))
     except SpecError as error:
         return tell_usage(error.problems)
     except SystemExit as stop:
@@ -133,32 +136,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     return make_dataset(spec, arguments.out, arguments.workers, arguments.slice, arguments.executor)
 
 
-def _defaults(words: Sequence[str]) -> Any:
-    """Return the arguments' defaults: those of the file named by --config, if any, over the built-in ones."""
-    path = None
-    for k, word in enumerate(words):
-        if word == "--config" and k + 1 < len(words):
-            path = words[k + 1]
-        elif word.startswith("--config="):
-            path = word.removeprefix("--config=")
-    base = Arguments(out=tyro.MISSING)
-    if path is None:
-        return base
-    given = read_spec_fields(path)
-    parse_spec(given | _paths_given(words))  # its own faults are told before those of the command line
-    return replace(base, **given)
-
-
-def _paths_given(words: Sequence[str]) -> dict[str, Any]:
-    """Return source and assets as the command line has them, as they must fit each other."""
-    found = {}
-    for name in ("source", "assets"):
-        for k, word in enumerate(words):
-            if word == f"--{name}" and k + 1 < len(words):
-                found[name] = words[k + 1]
-            elif word.startswith(f"--{name}="):
-                found[name] = word.split("=", 1)[1]
-    return found
+def _fields_given(words: Sequence[str], arguments: Arguments) -> dict[str, Any]:
+    """Return the fields of the specification that the command line names itself, which win over those of a file."""
+    named = {word.partition("=")[0].removeprefix("--").replace("-", "_") for word in words if word.startswith("--")}
+    wanted = [f.name for f in fields(Arguments) if f.name in named and f.name not in NOT_IN_THE_SPEC]
+    return {name: getattr(arguments, name) for name in wanted}
 
 
 if __name__ == "__main__":

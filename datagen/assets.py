@@ -21,12 +21,22 @@ import trimesh
 from torch import Tensor
 
 from datagen.colour import linear_from_srgb
-from datagen.formats import MeshError, announced_faces, join_looks, read_checked, short_reason, utf8_text
+from datagen.formats import (
+    MeshError,
+    announced_faces,
+    check_size,
+    join_looks,
+    printable,
+    read_checked,
+    short_reason,
+    utf8_text,
+)
 
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 MAX_FACES = 50_000_000
 MAX_VERTICES = 25_000_000
 MAX_COORDINATE = 1e6  # beyond it float32 positions are coarser than a thousandth
+MAX_TEXELS = 80 * 2**20  # of a file's textures, unpacked 320 MiB
 SMALLEST_EXTENT = 1e-12  # of what is scaled to a radius of 1: below it there is rounding only
 FACES_AT_ONCE = 1_000_000
 NO_SRGB_LOOK = np.array([[0.7, 0.7, 0.7, 1.0]])  # of parts without a colour beside parts that have one
@@ -50,6 +60,13 @@ class CompanionFiles(trimesh.resolvers.FilePathResolver):
 
     def get(self, name: str) -> bytes:
         """Return the bytes of a companion file, the text of a material library made UTF-8. Source: ours."""
+        for place in (name.strip(), name.strip().lstrip("/"), Path(name).name):  # where the base class looks
+            try:
+                found = self.absolute(place)
+            except ValueError:  # outside of the folder
+                continue
+            if found.exists():
+                check_size(found)  # a pipe would be waited for
         data = super().get(name)
         return utf8_text(data) if Path(name.strip()).suffix.lower() == ".mtl" else data
 
@@ -91,15 +108,22 @@ def file_state(path: Path) -> tuple[int, int]:
     return found.st_mtime_ns, found.st_size
 
 
-def files_under(folder: str | Path) -> list[str]:
+def files_under(folder: str | Path) -> tuple[list[str], list[tuple[str, str]]]:
     """Return the relative paths of all files under a folder, sorted; links to folders are not followed.
+
+    Also the folders in it that cannot be read, with the reason.
 
     Source: ours.
     """
-    found = []
-    for root, _, files in os.walk(folder, followlinks=False):
+    found, unread = [], []
+
+    def note(error: OSError) -> None:
+        place = Path(error.filename).relative_to(folder).as_posix()
+        unread.append((printable(place), f"expected a readable folder, got {error.strerror}"))
+
+    for root, _, files in os.walk(folder, onerror=note, followlinks=False):
         found += [(Path(root) / f).relative_to(folder).as_posix() for f in files if not f.startswith(".")]
-    return sorted(found)
+    return sorted(found), sorted(unread)
 
 
 def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, tuple[str, ...]]:
@@ -119,7 +143,8 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the gate below decides, not the parser
             scene = trimesh.load_scene(io.BytesIO(data), file_type=suffix[1:], **options)
-            parts = [_part(scene, node) for node in sorted(scene.graph.nodes_geometry, key=str)]
+            _check_pictures(path, scene)
+            parts = _parts(path, scene)
     except MeshError:
         raise
     except ModuleNotFoundError as error:
@@ -127,9 +152,6 @@ def parse_mesh(path: Path) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None
         raise MeshError(path, f"expected a file readable without further packages, got {why}") from None
     except Exception as error:  # the parsers raise ValueError, IndexError, KeyError, UnboundLocalError and more
         raise MeshError(path, f"expected a readable {suffix} file, got {short_reason(error)}") from None
-    parts = [p for p in parts if p is not None]
-    if sum(len(p[1]) for p in parts) > MAX_FACES or sum(len(p[0]) for p in parts) > MAX_VERTICES:
-        raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
     if not parts:
         raise MeshError(path, "expected triangles, got none")
     announced, found = announced_faces(suffix, data), sum(len(p[1]) for p in parts)
@@ -154,10 +176,50 @@ def split_looks(looks: np.ndarray | None) -> tuple[Tensor | None, Tensor | None]
     return rgba[:, :3].contiguous(), rgba[:, 3].contiguous() if bool((rgba[:, 3] < 1).any()) else None
 
 
-def _part(scene: Any, node: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:
+def _check_pictures(path: Path, scene: Any) -> None:
+    """Refuse textures that are larger in all than it is safe to unpack: a few bytes may announce any number."""
+    pictures = {id(p): p for g in scene.geometry.values() if (p := _picture(g)) is not None}
+    texels = sum(p.width * p.height for p in pictures.values())
+    if texels > MAX_TEXELS:
+        raise MeshError(path, f"textures: expected at most {MAX_TEXELS} texels in all, got {texels}")
+
+
+def _picture(geometry: Any) -> Any:
+    """Return the picture that a mesh wears, or none."""
+    material = getattr(geometry.visual, "material", None) if hasattr(geometry, "visual") else None
+    return getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+
+
+def _parts(path: Path, scene: Any) -> list[tuple[np.ndarray, np.ndarray, np.ndarray | None]]:
+    """Return the parts that have triangles, as `_part` does, or raise MeshError as soon as they are too many."""
+    parts, n_vertices, n_faces = [], 0, 0
+    worlds: dict[str, np.ndarray] = {}
+    for node in sorted(scene.graph.nodes_geometry, key=str):
+        part = _part(scene, node, _world(scene.graph, node, worlds))
+        if part is None:
+            continue
+        n_vertices, n_faces = n_vertices + len(part[0]), n_faces + len(part[1])
+        if n_faces > MAX_FACES or n_vertices > MAX_VERTICES:
+            raise MeshError(path, f"expected at most {MAX_FACES} faces and {MAX_VERTICES} vertices, got more")
+        parts.append(part)
+    return parts
+
+
+def _world(graph: Any, node: str, worlds: dict[str, np.ndarray]) -> np.ndarray:
+    """Return a node's (4, 4) transform to world space; `worlds` keeps those known, as the parser multiplies anew."""
+    parents, chain = graph.transforms.parents, []
+    while node not in worlds and node in parents:
+        chain.append(node)
+        node = parents[node]
+    matrix = worlds.get(node, np.eye(4))
+    for below in reversed(chain):
+        matrix = worlds[below] = matrix @ graph.get(frame_to=below, frame_from=parents[below])[0]
+    return matrix
+
+
+def _part(scene: Any, node: str, transform: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None] | None:
     """Return world vertices, faces and (F, 4) sRGB colours in [0, 1] of one node, or None if it has no triangles."""
-    transform, name = scene.graph[node]
-    geometry = scene.geometry[name]
+    geometry = scene.geometry[scene.graph.transforms.node_data[node]["geometry"]]
     faces = np.asarray(getattr(geometry, "faces", np.zeros((0, 3), np.int64)))
     vertices = np.asarray(geometry.vertices, dtype=np.float64)
     if len(faces) == 0:
@@ -175,7 +237,7 @@ def _part_rgba(geometry: Any, faces: np.ndarray) -> np.ndarray | None:
         colours = np.asarray(visual.face_colors)
     elif visual.kind == "texture":
         uv, material = visual.uv, visual.material
-        image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)
+        image = _picture(geometry)
         if uv is not None and len(uv) == len(geometry.vertices) and image is not None and np.isfinite(uv).all():
             colours = np.asarray(material.to_color(np.asarray(uv)[faces].mean(1)))
         else:
@@ -230,11 +292,11 @@ def normalise(path: str | Path, positions: Tensor, faces: Tensor) -> Tensor:
     Source: ours.
     """
     points = positions.reshape(-1, 3)
-    centred = positions - (points.amin(0) + points.amax(0)) / 2
-    radius = float(centred.norm(dim=-1).max())
+    scaled = positions - (points.amin(0) + points.amax(0)) / 2
+    radius = float(scaled.norm(dim=-1).max())
     if not radius > SMALLEST_EXTENT:
         raise MeshError(path, f"vertices: expected some extent, got a radius of {radius:g}")
-    scaled = centred / radius
+    scaled /= radius
     if not any(has_area(frame[part]) for frame in scaled for part in faces.split(FACES_AT_ONCE)):
         raise MeshError(path, "faces: expected a triangle with an area, got none")
     return scaled

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.entries import is_sharded, read_entries
-from datagen.folders import RUN_NAME, encode_run, read_run, record_sum
+from datagen.folders import RUN_NAME, encode_run, read_run, read_whole_run, record_sum
 from datagen.listed_files import file_damage, is_of_configuration
 from datagen.manifest import MANIFEST_NAME, ManifestError, encode_entry, scan_manifest
 from datagen.report import SHEET_NAME
@@ -89,13 +89,13 @@ def read_status(folder: str | Path) -> Status:
     """Return how far a data set is.
 
     Raises:
-        ManifestError, SpecError: the lists are damaged.
+        RecordError, SpecError: the lists are damaged.
         FileNotFoundError: there is no list of frames.
 
     Source: ours.
     """
     folder = Path(folder)
-    spec, entries = recorded_spec(read_run(folder)["spec"]), read_entries(folder)
+    spec, entries = recorded_spec(read_whole_run(folder)["spec"]), read_entries(folder)
     failed: dict[int, str] = {}
     refused: dict[str, str] = {}
     for place in sorted(folder.glob("failures*.json")):

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from datagen.spec import DatasetSpec, SpecError, parse_spec
+from datagen.spec import ADDED_LATER, DatasetSpec, SpecError, parse_spec
 
 EXIT_DONE, EXIT_FAILURES, EXIT_USAGE, EXIT_DAMAGED, EXIT_INTERRUPTED = 0, 1, 2, 3, 130
 
@@ -86,14 +86,21 @@ class Retry:
     """Processes that make frames; 0 and 1 work in this one."""
     executor: Literal["local", "ray"] = "local"
     """Processes of this machine, or Ray's workers."""
+    assets: str | None = None
+    """Where the assets are now, if not where run.json has them."""
+    textures: str | None = None
+    """Where the pictures for textures are now."""
+    backgrounds: str | None = None
+    """Where the pictures for backgrounds are now."""
 
     def run(self) -> int:
         """Make the frames. Source: ours."""
         from datagen.folders import read_run
 
-        return make_dataset(
-            parse_spec(read_run(self.folder)["spec"]), self.folder, self.workers, executor=self.executor
-        )
+        places = {"assets": self.assets, "textures": self.textures, "backgrounds": self.backgrounds}
+        moved = {name: place for name, place in places.items() if place is not None}
+        spec = parse_spec(ADDED_LATER | read_run(self.folder)["spec"] | moved)
+        return make_dataset(spec, self.folder, self.workers, executor=self.executor)
 
 
 @dataclass(frozen=True)
@@ -205,7 +212,7 @@ def run_command(command: Any) -> int:
 
     Source: ours.
     """
-    from datagen.manifest import ManifestError
+    from datagen.folders import RecordError
     from datagen.writer import FrameFileError
 
     try:
@@ -214,15 +221,12 @@ def run_command(command: Any) -> int:
         return tell_usage(error.problems)
     except FileNotFoundError as error:
         return tell_usage([f"expected a data set, got none: {error.filename or error}"])
-    except (ManifestError, FrameFileError) as error:
+    except (RecordError, FrameFileError) as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_DAMAGED
     except OSError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILURES
-    except KeyboardInterrupt:
-        print("interrupted; the same command finishes the rest", file=sys.stderr)
-        return EXIT_INTERRUPTED
 
 
 def make_dataset(
@@ -252,9 +256,6 @@ def make_dataset(
     except (OSError, FrameFileError) as error:  # frames that are listed stay whole; the rest can be made again
         print(f"error: {error}", file=sys.stderr)
         return EXIT_FAILURES
-    except KeyboardInterrupt:
-        print("interrupted; the same command finishes the rest", file=sys.stderr)
-        return EXIT_INTERRUPTED
     print(f"{result.made} frames made, {result.kept} kept, {len(result.failed)} failed in {result.folder}")
     if result.effects:
         print("effects, in share of the frames: " + ", ".join(f"{n} {s:.0%}" for n, s in result.effects.items()))

@@ -1,12 +1,13 @@
 """Dataset: what was written, as tensors for training.
 
-Before: writer.py, entries.py.  After: report.py and people's training code.
+Before: writer.py, shards.py, entries.py.  After: report.py and people's training code.
 Images leave as (C, H, W) float32. Symbols: H, W image size.
 """
 
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,8 @@ from torch.utils.data import Dataset
 
 from datagen.entries import read_entries
 from datagen.listed_files import read_listed_file
+from datagen.manifest import ManifestError
+from datagen.shards import marker_entries, read_marker
 from datagen.writer import FrameFileError, decode_exr, frame_paths
 
 # name -> (part, channels)
@@ -32,6 +35,7 @@ PLANES: dict[str, tuple[str, tuple[str, ...]]] = {
     "shadow": ("data", ("shadow",)),
     "sharp_alpha": ("sharp", ("A",)),
 }
+REMADE_TRIES, REMADE_WAIT_S = 20, 0.1
 IDS = {"mesh_id": "id.mesh", "face_id": "id.face"}
 
 
@@ -133,8 +137,28 @@ class BlurDataset(Dataset[dict[str, Any]]):
         file: dict[str, Any] = {"path": path, "sha256": sha256.decode(), "bytes": size}
         if tar:
             file |= {"tar": tar.decode(), "offset": offset}
-        data = read_listed_file(self.folder, {"files": [file]}, path)
+        try:
+            data = read_listed_file(self.folder, {"files": [file]}, path)
+        except FrameFileError:
+            if not tar:
+                raise
+            data = self._read_remade(Path(tar.decode()), index, path)
         return (self.folder / path, *decode_exr(data, str(self.folder / path)))
+
+    def _read_remade(self, tar: Path, index: int, path: str) -> bytes:
+        """Return the bytes of a frame whose shard may have been made again, with frames that had failed, since."""
+        entries: dict[int, dict[str, Any]] = {}
+        for _ in range(REMADE_TRIES):
+            try:
+                entries = {e["index"]: e for e in marker_entries(read_marker(self.folder, int(tar.stem)))}
+                break
+            except ManifestError:  # a shard has no marker between the two renames
+                time.sleep(REMADE_WAIT_S)
+        if index not in entries:
+            raise FrameFileError(
+                f"{self.folder}: expected frame {index} in {tar}, got a shard that no marker puts it in"
+            )
+        return read_listed_file(self.folder, entries[index], path)
 
 
 def _stack(parts: dict[str, dict[str, np.ndarray]], part: str, channels: tuple[str, ...]) -> Tensor:

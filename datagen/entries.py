@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from datagen.folders import SHARD_FOLDER
-from datagen.manifest import ManifestError, read_manifest
+from datagen.manifest import MANIFEST_NAME, ManifestError, read_manifest
 from datagen.shards import marker_entries, scan_shards
 
 
 def is_sharded(folder: str | Path) -> bool:
-    """Tell whether a data set is stored in tar files. Source: ours."""
-    return (Path(folder) / SHARD_FOLDER).is_dir()
+    """Tell whether a data set is stored in tar files: without the list that a folder of files has. Source: ours."""
+    return (Path(folder) / SHARD_FOLDER).is_dir() and not (Path(folder) / MANIFEST_NAME).exists()
 
 
 def read_entries(folder: str | Path) -> dict[int, dict[str, Any]]:

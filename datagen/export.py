@@ -18,7 +18,7 @@ from datagen.colour import gamma_bytes_from_linear
 from datagen.dataset import BlurDataset
 from datagen.entries import read_entries
 from datagen.flow_files import FLOW_SUFFIXES, FlowFileError, encode_flow
-from datagen.folders import read_run
+from datagen.folders import read_whole_run, sweep
 from datagen.layouts import CODED, FLOWS, LAYOUTS, PICTURES, Layout, place_of
 from datagen.listed_files import read_listed_file
 from datagen.picture_store import PAGE_BYTES, need_lmdb, write_store
@@ -68,7 +68,7 @@ def export_dataset(
 
     Raises:
         ExportError: what does not fit, all of it, before anything is written.
-        ManifestError, SpecError, FileNotFoundError: `folder` holds no data set, or a damaged one.
+        RecordError, SpecError, FileNotFoundError: `folder` holds no data set, or a damaged one.
         FrameFileError: a frame is damaged; it is named. What was written before stays.
         FlowFileError: motion that the flow format cannot hold; the frame is named.
         ModuleNotFoundError: the layout needs an optional package.
@@ -76,9 +76,11 @@ def export_dataset(
     Source: ours; layouts.py names the layouts'.
     """
     folder, out = Path(folder), Path(out)
-    run = read_run(folder)
+    run = read_whole_run(folder)
     entries = read_entries(folder)
     problems = _request_problems(layout, split, flow_suffix) or _data_problems(run, entries, LAYOUTS[layout])
+    if out.resolve().is_relative_to(folder.resolve()):
+        problems.append(f"out: expected a folder outside of the data set {str(folder)!r}, got {str(out)!r}")
     if problems:
         raise ExportError(problems)
     form = LAYOUTS[layout]
@@ -164,8 +166,12 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
     elif held:
         found_names = ", ".join(held[:3]) + (", …" if len(held) > 3 else "")
         raise ExportError([f"out: expected an empty folder or one of the same export, got {found_names}"])
-    out.mkdir(parents=True, exist_ok=True)
-    _write_record(out, record | {"is_finished": False})
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        _write_record(out, record | {"is_finished": False})
+    except OSError as error:
+        raise ExportError([f"out: expected a folder that can be written, got {str(out)!r}: {error.strerror}"]) from None
+    sweep(place for place in (out, *out.rglob("*/")) if place.is_dir())  # what a killed export left
 
 
 def _write_record(out: Path, record: dict[str, Any]) -> None:

@@ -28,7 +28,12 @@ except ImportError:  # Windows has no such locks; two runs in one folder are the
 
 TEMPORARY_PATTERN = f"{TEMPORARY_PREFIX}[0-9]*-[0-9]*-*"
 RUN_NAME, LOCK_NAME, SHARD_FOLDER = "run.json", ".lock", "shards"
+MAX_SLICE_DIGITS = 9
 SHARDS_FROM = 1000  # frames; below, `auto` means a file for each thing
+
+
+class RecordError(ValueError):
+    """What a data set says of itself is damaged; a run repairs it."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +61,7 @@ def parse_slice(text: str) -> Slice:
     Source: ours.
     """
     number, slash, of = text.partition("/")
-    is_valid = slash and all(part.isascii() and part.isdecimal() for part in (number, of))
+    is_valid = slash and all(p.isascii() and p.isdecimal() and len(p) <= MAX_SLICE_DIGITS for p in (number, of))
     if not is_valid or not 1 <= int(number) <= int(of):
         raise SpecError([f"slice: expected i/n with i from 1 to n, got {text!r}"])
     return Slice(int(number), int(of))
@@ -90,10 +95,26 @@ def locked_folder(out: str | Path, part: Slice | None = None) -> Iterator[Path]:
                     fcntl.flock(descriptor, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
             except OSError:
                 raise SpecError([f"out: expected a folder no other run works in, got {str(out)!r}"]) from None
+            if part is not None:
+                _refuse_other_slicings(folder, part)
         yield folder
     finally:
         for descriptor in held:
             os.close(descriptor)
+
+
+def _refuse_other_slicings(folder: Path, part: Slice) -> None:
+    """Raise SpecError while a run makes a part of another number of parts: both would write the same shards."""
+    for place in sorted(folder.glob(f"{LOCK_NAME}-*-of-*")):
+        if place.name.endswith(f"-of-{part.of}"):
+            continue
+        with place.open("rb") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except OSError:
+                other = place.name.removeprefix(f"{LOCK_NAME}-").replace("-of-", "/")
+                found = f"{part.number}/{part.of} while {other} is being made"
+                raise SpecError([f"slice: expected parts of one slicing at a time, got {found}"]) from None
 
 
 @contextmanager
@@ -189,6 +210,22 @@ def read_run(folder: str | Path) -> dict[str, Any]:
     raise SpecError([f"out: expected a readable {RUN_NAME}, got {str(path)!r} damaged"])
 
 
+def read_whole_run(folder: str | Path) -> dict[str, Any]:
+    """Return what `run.json` of a data set holds, compared with its checksum.
+
+    Raises:
+        SpecError: it is missing.
+        RecordError: it is damaged.
+
+    Source: ours.
+    """
+    record = read_run(folder)
+    if record.get("record_sha256") != record_sum(record):
+        place = str(Path(folder) / RUN_NAME)
+        raise RecordError(f"{place}: expected a record with its checksum, got another; the next run mends it")
+    return record
+
+
 def encode_run(record: dict[str, Any]) -> bytes:
     """Return what `run.json` holds as its bytes. Source: ours."""
     return (json.dumps(record, indent=1, sort_keys=True) + "\n").encode()
@@ -213,6 +250,13 @@ def sweep(places: Iterable[Path], names: Iterable[str] = ("*",)) -> None:
         for name in names:
             for stale in holder.glob(f"{TEMPORARY_PREFIX}[0-9]*-[0-9]*-{name}"):
                 stale.unlink(missing_ok=True)
+
+
+def drop_empty(folder: Path, names: Iterable[str]) -> None:
+    """Remove those of a data set's folders that are there and empty. Source: ours."""
+    for name in names:
+        if (folder / name).is_dir() and not any((folder / name).iterdir()):
+            (folder / name).rmdir()
 
 
 def _is_left_by_a_start(path: Path) -> bool:

@@ -15,11 +15,14 @@ from typing import Any
 import numpy as np
 
 MAX_FILE_BYTES = 256 * 2**20  # parsing takes several times as much memory
+MAX_NUMBERS = 48 * 2**20  # that a file may hold or announce, as float64 384 MiB
 MAX_PLAYED_VERTICES = 500_000  # of a mesh that moves by itself: it is held at some 100 instants at once
 MAX_PLAYED_FACES = 1_000_000
 NO_LOOK = np.array([[0.45, 0.45, 0.45, 1.0]])  # linear; of parts without a colour beside parts that have one
 READABLE_EXTENSIONS = re.compile(r"KHR_(materials_\w+|texture_transform|lights_punctual)")
 COMPRESSIONS = ("KHR_draco_mesh_compression", "EXT_meshopt_compression")
+GLTF_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
+MAX_NODE_DEPTH = 256
 STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
 TAIL_BYTES = 65536
 
@@ -28,8 +31,8 @@ class MeshError(ValueError):
     """A file that cannot be used, and why."""
 
     def __init__(self, path: str | Path, reason: str) -> None:
-        super().__init__(f"{path}: {reason}")
-        self.path, self.reason = str(path), reason
+        self.path, self.reason = str(path), printable(reason)
+        super().__init__(printable(f"{path}: {reason}"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +64,11 @@ def join_looks(
     if all(look is None for look in looks):
         return None
     return np.concatenate([no_look.repeat(len(f), 0) if k is None else k for k, f in zip(looks, faces, strict=True)])
+
+
+def printable(text: str) -> str:
+    """Return text with what would steer a terminal, or begin a line, told as in Python's strings. Source: ours."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
 
 
 def short_reason(error: BaseException) -> str:
@@ -99,6 +107,8 @@ def read_checked(path: Path) -> tuple[bytes, tuple[str, ...]]:
         return data, _gltf_notes(path, data)
     if suffix == ".obj":
         _check_last_face(path, data)
+        if re.search(rb"^[ \t]*f[ \t](?:[^\n]*[ \t])?0+(?:[/\s]|$)", data, re.M):
+            raise MeshError(path, "faces: expected indices from 1, or below 0 for those from the end, got 0")
     if suffix == ".ply":  # a header of text before what may be binary
         header, end, body = data.partition(b"end_header")
         return utf8_text(header) + end + body, ()
@@ -173,8 +183,50 @@ def _gltf_notes(path: Path, data: bytes) -> tuple[str, ...]:
     remote = [u for u in places if re.match(r"\s*([a-z][a-z0-9+.-]*:|//)", u, re.I) and not u.startswith("data:")]
     if remote:
         raise MeshError(path, f"expected buffers and images in files beside it, got {remote[0][:80]!r}")
+    _check_numbers(path, tree)
+    _check_nodes(path, tree)
     still = [k for k in ("animations", "skins") if tree.get(k)]
     return (f"{' and '.join(still)} in the file are not read: the mesh keeps its rest pose",) if still else ()
+
+
+def _check_numbers(path: Path, tree: dict[str, Any]) -> None:
+    """Refuse a glTF file that announces more numbers than it is safe to hold: many parts may share few bytes."""
+    sizes = []
+    for entry in _list_in(tree, "accessors"):
+        count, kind = (entry.get("count"), entry.get("type")) if isinstance(entry, dict) else (0, "")
+        sizes.append(max(0, count) * GLTF_WIDTHS.get(str(kind), 16) if isinstance(count, int) else 0)
+    used = 0
+    for mesh in _list_in(tree, "meshes"):
+        for part in _list_in(mesh, "primitives") if isinstance(mesh, dict) else ():
+            named = [part.get("indices"), *part["attributes"].values()] if _has_attributes(part) else []
+            used += sum(sizes[k] for k in named if type(k) is int and 0 <= k < len(sizes))
+    if max(sum(sizes), used) > MAX_NUMBERS:
+        found = max(sum(sizes), used)
+        raise MeshError(path, f"accessors: expected at most {MAX_NUMBERS} numbers in all, got {found}")
+
+
+def _check_nodes(path: Path, tree: dict[str, Any]) -> None:
+    """Refuse a glTF file whose nodes are no trees, or hang so deep that the parser takes hours."""
+    parents: dict[int, int] = {}
+    for k, node in enumerate(_list_in(tree, "nodes")):
+        for child in _list_in(node, "children") if isinstance(node, dict) else ():
+            if type(child) is int and parents.setdefault(child, k) != k:
+                raise MeshError(path, f"nodes: expected at most one parent of each, got two of node {child}")
+    depths: dict[int, int] = {}
+    for k in parents:
+        chain, place = [], k
+        while place in parents and place not in depths and len(chain) <= MAX_NODE_DEPTH:
+            chain.append(place)
+            place = parents[place]
+        deepest = depths.get(place, 0) + len(chain)
+        if deepest > MAX_NODE_DEPTH:  # a ring as well
+            raise MeshError(path, f"nodes: expected at most {MAX_NODE_DEPTH} below each other, got more")
+        depths |= {node: deepest - n for n, node in enumerate(chain)}
+
+
+def _has_attributes(part: Any) -> bool:
+    """Tell whether a part of a glTF mesh has attributes."""
+    return isinstance(part, dict) and isinstance(part.get("attributes"), dict)
 
 
 def _list_in(tree: dict[str, Any], name: str) -> list[Any]:

@@ -7,11 +7,15 @@ A listed file is {`path`, `bytes`, `sha256`}; inside a shard it has `tar`, the s
 from __future__ import annotations
 
 import hashlib
+import os
+import re
 from pathlib import Path
 from typing import Any
 
 from datagen.spec import DatasetSpec
 from datagen.writer import FrameFileError, baselines_entry
+
+MAX_FILE_BYTES = 2**50  # of a file or a place in it
 
 
 def read_listed_file(folder: str | Path, entry: dict[str, Any], path: str) -> bytes:
@@ -32,6 +36,19 @@ def read_listed_file(folder: str | Path, entry: dict[str, Any], path: str) -> by
     if problem:
         raise FrameFileError(f"{folder}: expected the files that are listed, but {problem}")
     return data
+
+
+def is_listed(file: dict[str, Any]) -> bool:
+    """Tell whether a file of a list has a checksum, and numbers that a place in a file can have.
+
+    Raises:
+        KeyError, TypeError: it has not.
+
+    Source: ours.
+    """
+    numbers = [file["bytes"], *([file["offset"]] if "offset" in file else [])]
+    is_number = all(type(n) is int and 0 <= n < MAX_FILE_BYTES for n in numbers)
+    return is_number and re.fullmatch("[0-9a-f]{64}", file["sha256"]) is not None
 
 
 def is_of_configuration(entry: dict[str, Any], spec: DatasetSpec, config_sha256: str) -> bool:
@@ -60,7 +77,7 @@ def _read(folder: Path, file: dict[str, Any]) -> tuple[bytes, str]:
         if "tar" in file:
             with (folder / held).open("rb") as tar:
                 tar.seek(file["offset"])
-                data = tar.read(file["bytes"])
+                data = tar.read(min(file["bytes"], os.fstat(tar.fileno()).st_size))  # no memory for what is not there
         else:
             data = (folder / held).read_bytes()
     except FileNotFoundError:

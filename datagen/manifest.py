@@ -11,14 +11,13 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torchblur as tb
-from datagen.folders import check_run, sweep, write_run
-from datagen.listed_files import entry_damage, is_of_configuration
+from datagen.folders import SHARD_FOLDER, RecordError, check_run, drop_empty, sweep, write_run
+from datagen.listed_files import entry_damage, is_listed, is_of_configuration
 from datagen.scenes import Plan
 from datagen.spec import BASELINES, SpecError
 from datagen.writer import FOLDERS, frame_paths, sync_folder, write_atomically
@@ -26,7 +25,7 @@ from datagen.writer import FOLDERS, frame_paths, sync_folder, write_atomically
 MANIFEST_NAME = "manifest.jsonl"
 
 
-class ManifestError(ValueError):
+class ManifestError(RecordError):
     """A manifest that is damaged other than by a line cut short at its end; a run repairs it."""
 
 
@@ -60,6 +59,7 @@ def begin_run(folder: Path, plan: Plan) -> Holdings:
     if found and plan.config_sha256 not in found:  # among fitting ones, a line that does not fit is a damaged line
         wanted_sum = plan.config_sha256
         raise SpecError([f"out: expected frames of configuration {wanted_sum} in {folder}, got {min(found)}"])
+    drop_empty(folder, (SHARD_FOLDER,))  # of a start with the other storage
     for name in FOLDERS:
         (folder / name).mkdir(exist_ok=True)
     sweep_frames(folder)
@@ -159,8 +159,7 @@ def _is_entry(entry: Any) -> bool:
     for names, some in zip((entry["effects"], entry.get("baselines", [])), known, strict=True):
         if not isinstance(names, list) or not all(name in some for name in names):
             return False
-    sums_fit = all(re.fullmatch("[0-9a-f]{64}", file["sha256"]) for file in files)
-    return sums_fit and sorted(file["path"] for file in files) == sorted(frame_paths(index).values())
+    return all(map(is_listed, files)) and sorted(file["path"] for file in files) == sorted(frame_paths(index).values())
 
 
 def _damage(folder: Path, entry: dict[str, Any], plan: Plan) -> str:

@@ -13,6 +13,7 @@ from PIL import Image, ImageDraw, ImageOps, UnidentifiedImageError
 
 PHOTO_FORMATS = ("PNG", "JPEG", "WEBP", "BMP")
 PHOTO_MODES = ("1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr")  # of 8 bits a channel at most
+PNG_DEPTH_AT = 24  # of the header, which comes first
 MAX_PHOTO_PIXELS = 60_000_000  # as linear light 12 bytes each
 
 
@@ -78,6 +79,9 @@ def decode_photo(data: bytes) -> np.ndarray:
             with Image.open(io.BytesIO(data), formats=PHOTO_FORMATS) as image:
                 if image.width * image.height > MAX_PHOTO_PIXELS:
                     raise PhotoError(f"expected at most {MAX_PHOTO_PIXELS} pixels, got {image.width} x {image.height}")
+                depth = data[PNG_DEPTH_AT] if image.format == "PNG" else 8  # Pillow makes 16 bits of colour 8 unasked
+                if depth > 8:
+                    raise PhotoError(f"expected 8 bits a channel, got {depth}")
                 if image.mode not in PHOTO_MODES:
                     raise PhotoError(f"expected 8 bits a channel, got pixels of mode {image.mode}")
                 image.load()

@@ -56,8 +56,6 @@ def logged_run(folder: Path, workers: int, part: str) -> Iterator[RunNote]:
 
     Source: ours.
     """
-    if not part:
-        _drop_damaged_lines(folder)
     note = RunNote(time.time(), 0.0, 0, 0, workers, part)
     start = time.monotonic()
     try:
@@ -99,6 +97,16 @@ def read_log(folder: str | Path) -> tuple[list[RunNote], int]:
     return notes, unread
 
 
+def drop_damaged_lines(folder: Path) -> None:
+    """Write the log anew if lines of it cannot be read. Source: ours."""
+    try:
+        notes, unread = read_log(folder)
+        if unread:
+            write_atomically(folder / LOG_NAME, b"".join(encode_line(asdict(note)) for note in notes))
+    except OSError as error:
+        print(f"{folder / LOG_NAME}: expected a log that can be mended, got {error.strerror}", file=sys.stderr)
+
+
 def encode_line(fields: dict[str, Any]) -> bytes:
     """Return a note's fields as its line of the log, with its checksum. Source: ours."""
     return json.dumps(fields | {"line_sha256": record_sum(fields)}, sort_keys=True).encode() + b"\n"
@@ -114,13 +122,3 @@ def _add_line(place: Path, line: bytes) -> None:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     finally:
         os.close(descriptor)
-
-
-def _drop_damaged_lines(folder: Path) -> None:
-    """Write the log anew if lines of it cannot be read."""
-    try:
-        notes, unread = read_log(folder)
-        if unread:
-            write_atomically(folder / LOG_NAME, b"".join(encode_line(asdict(note)) for note in notes))
-    except OSError as error:
-        print(f"{folder / LOG_NAME}: expected a log that can be mended, got {error.strerror}", file=sys.stderr)

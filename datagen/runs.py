@@ -8,7 +8,7 @@ A task is a frame, or a shard's frames; both return {`entries`, `failed`} as JSO
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from datagen.manifest import Holdings, append_entry, begin_run, sweep_frames, wr
 from datagen.progress import Progress
 from datagen.ray_executor import check_ray, run_ray
 from datagen.report import effect_shares, write_contact_sheet
-from datagen.run_log import logged_run
+from datagen.run_log import drop_damaged_lines, logged_run
 from datagen.samples import Sample, make_sample
 from datagen.scenes import Plan, plan_from_json, survey_plan
 from datagen.sensor import photograph
@@ -91,6 +91,8 @@ def generate(
     part_text = f"{part.number}/{part.of}" if part else ""
     with locked_folder(out, part) as folder, logged_run(folder, max(workers, 1), part_text) as note:
         run = _begin(folder, plan, part)
+        if part is None:
+            drop_damaged_lines(folder)
         entries, kept = run.holdings.entries, len(run.holdings.entries)
         repaired = [f"{note}; made again if a frame was lost with it" for note in run.holdings.notes]
         failed = []
@@ -99,7 +101,7 @@ def generate(
                 progress.say(f"{len(refused)} asset files refused, listed at the end")
             for line in repaired:
                 progress.say(line)
-            text = plan.to_json()
+            text = _placed(plan).to_json()
             processes = min(max(workers, 1), max(len(run.todo), 1))
             if processes > 1 and spec.backend == "auto":
                 compile_ahead()
@@ -151,6 +153,13 @@ def make_shard(plan_json: str, folder: str, number: int) -> str:
 def _take(plan_json: str, index: int) -> Sample:
     """Return a frame's sample with its pictures."""
     return photograph(make_sample(plan_json, index), plan_from_json(plan_json).spec, index)
+
+
+def _placed(plan: Plan) -> Plan:
+    """Return the plan with whole paths, for workers that may have started in another folder."""
+    places = {name: getattr(plan.spec, name) for name in ("assets", "textures", "backgrounds")}
+    whole = {name: str(Path(place).absolute()) for name, place in places.items() if place is not None}
+    return replace(plan, spec=plan.spec.model_copy(update=whole))
 
 
 @dataclass(frozen=True)

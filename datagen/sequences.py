@@ -24,7 +24,7 @@ from datagen.assets import (
     parse_mesh,
     tensors_sha256,
 )
-from datagen.formats import MeshError, check_size, short_reason
+from datagen.formats import MAX_FILE_BYTES, MAX_NUMBERS, MeshError, check_size, short_reason
 
 CACHE_SUFFIX = ".npz"
 
@@ -63,7 +63,10 @@ def load_sequence(path: str) -> SequenceAsset:
     Source: ours.
     """
     place = Path(path)
-    files = sorted(place.iterdir()) if place.is_dir() else [place]
+    files = [place]
+    if place.is_dir():  # what frames may name beside them counts too, but need not be there
+        frames = _frame_names(place)
+        files = [file for file in sorted(place.iterdir()) if file.name in frames or file.exists()]
     return _load_sequence(path, tuple(file_state(file) for file in files))
 
 
@@ -80,7 +83,11 @@ def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAs
     check_size(place)
     try:
         with place.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            if (size := sum(part.file_size for part in archive.zip.infolist())) > MAX_FILE_BYTES:
+                raise MeshError(path, f"expected at most {MAX_FILE_BYTES} bytes when unpacked, got {size}")
             arrays = {name: archive[name] for name in ("vertices", "faces") if name in archive.files}
+    except MeshError:
+        raise
     except (OSError, ValueError, KeyError, EOFError, NotImplementedError, SyntaxError) as error:
         raise MeshError(path, f"expected a readable .npz file without pickles, got {short_reason(error)}") from None
     except Exception as error:  # zipfile and zlib raise their own kinds on broken archives
@@ -91,6 +98,8 @@ def _load_sequence(path: str, states: tuple[tuple[int, int], ...]) -> SequenceAs
     positions, faces = arrays["vertices"], arrays["faces"]
     if positions.ndim != 3 or positions.shape[-1] != 3 or positions.dtype.kind != "f":
         raise MeshError(path, f"vertices: expected (frames, V, 3) float, got {positions.shape} {positions.dtype}")
+    if positions.size > MAX_NUMBERS:
+        raise MeshError(path, f"vertices: expected at most {MAX_NUMBERS} numbers in all, got {positions.size}")
     if len(positions) < 1:
         raise MeshError(path, "vertices: expected at least one frame, got none")
     flat, indices = check_geometry(path, positions.reshape(-1, 3), faces, positions.shape[1])
@@ -114,5 +123,5 @@ def _load_frames(folder: Path) -> SequenceAsset:
 
 def _frame_names(folder: Path) -> list[str]:
     """Return the mesh files directly in a folder, ordered by the numbers in their names."""
-    names = [p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES and p.is_file()]
+    names = [p.name for p in folder.iterdir() if p.suffix.lower() in MESH_SUFFIXES and not p.is_dir()]
     return sorted(names, key=lambda n: ([int(d) for d in re.findall(r"\d+", n)], n))

@@ -18,13 +18,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from datagen.folders import RUN_NAME, SHARD_FOLDER, Slice, check_run, one_at_a_time, record_sum, sweep, write_run
-from datagen.listed_files import entry_damage, file_damage, read_listed_file
+from datagen.folders import (
+    RUN_NAME,
+    SHARD_FOLDER,
+    Slice,
+    check_run,
+    drop_empty,
+    one_at_a_time,
+    record_sum,
+    sweep,
+    write_run,
+)
+from datagen.listed_files import entry_damage, file_damage, is_listed, read_listed_file
 from datagen.manifest import Holdings, ManifestError
 from datagen.samples import Sample
 from datagen.scenes import Plan
 from datagen.spec import DatasetSpec, SpecError
 from datagen.writer import (
+    FOLDERS,
     FrameFileError,
     atomic_file,
     frame_contents,
@@ -78,6 +89,7 @@ def begin_shards(folder: Path, plan: Plan, part: Slice | None = None) -> Holding
     numbers = run_shards(plan.spec, part)
     with one_at_a_time(folder):
         notes = check_run(folder, plan, lambda: _bear_out(folder, plan))
+        drop_empty(folder, FOLDERS)  # of a start with the other storage
         (folder / SHARD_FOLDER).mkdir(exist_ok=True)
         if part is not None:
             sweep((folder,), (RUN_NAME, f"*-{part.number}-of-{part.of}.json"))
@@ -190,7 +202,9 @@ def read_marker(folder: Path, number: int) -> dict[str, Any]:
         data = place.read_bytes()
         marker = json.loads(data)
         is_valid = marker["record_sha256"] == record_sum(marker) and _encode_marker(marker) == data
-        is_valid = is_valid and marker["shard"] == number and bool(marker_entries(marker))
+        is_valid = is_valid and marker["shard"] == number and type(marker["bytes"]) is int
+        files = [file for entry in marker_entries(marker) for file in entry["files"]]
+        is_valid = is_valid and bool(files) and all(is_listed(file) and "offset" in file for file in files)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
         is_valid = False
     if not is_valid:
@@ -209,7 +223,8 @@ def scan_shards(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
         try:
             markers.append(read_marker(folder, number))
         except ManifestError as error:
-            notes.append(str(error))
+            if place.exists():  # else its shard is being made once more
+                notes.append(str(error))
     return markers, notes
 
 

@@ -237,7 +237,7 @@ def read_spec_fields(path: str | Path) -> dict[str, Any]:
     """
     try:
         return tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except (OSError, ValueError, RecursionError) as error:  # also of numbers with too many digits
         raise SpecError([f"config: expected a readable TOML file, got {str(path)!r}: {error}"]) from None
 
 

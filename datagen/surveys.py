@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from datagen.assets import Roster, files_under
-from datagen.formats import MeshError
+from datagen.formats import MeshError, printable
 
 
 @dataclass(frozen=True)
@@ -39,25 +39,26 @@ def survey_folder(folder: str | Path, kind: Kind, content: Callable[[Path], byte
 
     Source: ours.
     """
-    names, refused, digest = [], [], hashlib.sha256()
-    for name in files_under(folder):
+    names, digest = [], hashlib.sha256()
+    found, refused = files_under(folder)
+    for name in found:
         suffix = Path(name).suffix.lower()
         told = name.encode("utf-8", "surrogateescape").decode("utf-8", "backslashreplace")
         if suffix in kind.read + kind.unread and told != name:  # neither a page nor a record could hold it
             refused.append((told, "expected a file name in UTF-8"))
             continue
         if suffix in kind.unread:
-            refused.append((name, f"expected one of {', '.join(kind.told)}, got a {suffix} file"))
+            refused.append((printable(name), f"expected one of {', '.join(kind.told)}, got a {suffix} file"))
         if suffix not in kind.read:
             continue
         try:
             held = content(Path(folder) / name)
         except kind.error as error:
-            refused.append((name, error.reason))
+            refused.append((printable(name), error.reason))
             continue
         names.append(name)
         digest.update(name.encode() + b"\0" + held)
     if not names:
-        found = "; ".join(f"{n}: {r}" for n, r in refused) or f"no {kind.name} file at all"
-        raise kind.error(folder, f"expected at least one usable {kind.name} file, got {found}")
+        reasons = "; ".join(f"{n}: {r}" for n, r in refused) or f"no {kind.name} file at all"
+        raise kind.error(folder, f"expected at least one usable {kind.name} file, got {reasons}")
     return Roster(tuple(names), tuple(refused), digest.hexdigest())

@@ -174,7 +174,7 @@ def _checked_layers(path: Path) -> tuple[Any, str]:
         if layer is None:
             raise MeshError(path, f"expected a readable layer, got {place.name}")
         layer.Reload(True)  # the library keeps layers, also of files that have changed since
-        for name in sorted(layer.GetCompositionAssetDependencies()):
+        for name in filter(None, sorted(layer.GetCompositionAssetDependencies())):  # none: the layer itself
             if "[" in name or ":" in name:
                 raise MeshError(path, f"expected layers in files under its own folder, got {name[:80]!r}")
             waiting.append((place.parent / name).resolve())

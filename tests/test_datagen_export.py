@@ -233,11 +233,29 @@ def test_every_wrong_argument_is_named_before_anything_is_written(folder, tmp_pa
     with pytest.raises(ExportError, match=r"flow_suffix: expected none for layout gopro; those with flow are sintel"):
         export_dataset(folder, tmp_path / "out", "gopro", flow_suffix=".flo")
     assert not (tmp_path / "out").exists()
-    with pytest.raises(ExportError, match=r"out: expected an empty folder .* got \.lock, \.runs\.log, blur, …"):
-        export_dataset(folder, folder, "gopro")
+    for inside in (folder, folder / "shards", folder / "a/../b"):
+        with pytest.raises(ExportError, match="out: expected a folder outside of the data set"):
+            export_dataset(folder, inside, "gopro")
+        assert not (folder / "shards").exists()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/thesis.tex").write_text("x")
+    with pytest.raises(ExportError, match=r"out: expected an empty folder .* got thesis\.tex"):
+        export_dataset(folder, tmp_path / "other", "gopro")
     (tmp_path / "file").write_text("x")
     with pytest.raises(ExportError, match="out: expected a folder, got the file"):
         export_dataset(folder, tmp_path / "file", "gopro")
+    with pytest.raises(ExportError, match="out: expected a folder that can be written, got '/proc/out'"):
+        export_dataset(folder, "/proc/out", "gopro")
+
+
+def test_what_a_killed_export_left_is_gone_after_the_next(folder, tmp_path):
+    exported(folder, tmp_path, "gopro")
+    before = tree(tmp_path / "gopro")
+    left = tmp_path / "gopro/train/clip000000/sharp/.tmp-4317-4-000001.png"
+    left.write_bytes(b"half a picture")
+    (tmp_path / "gopro/.tmp-4317-0-export.json").write_bytes(b"{")
+    exported(folder, tmp_path, "gopro")
+    assert tree(tmp_path / "gopro") == before
 
 
 def test_unfinished_sets_and_single_frames_are_refused(folder, tmp_path):

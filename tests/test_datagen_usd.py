@@ -95,6 +95,15 @@ def test_display_colours_of_every_kind(tmp_path, kind, values, expected):
         load_animated(short)
 
 
+def test_references_inside_the_file_are_followed(tmp_path):
+    proto = 'def Xform "proto" {\n' + mesh() + "}\n"
+    copy = 'def Xform "copy" ( references = </proto> ) {\ndouble3 xformOp:translate = (2, 0, 0)\n'
+    path = write(tmp_path, proto + copy + 'uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n')
+    points = load_animated(path).actions[0].pose.at(torch.zeros(1, dtype=torch.float64))
+    assert points.shape[-2] == 8
+    assert survey_meshes(tmp_path).names == ("a.usda",)
+
+
 def test_layers_under_the_folder_count_and_others_are_refused(tmp_path):
     (tmp_path / "in").mkdir()
     write(tmp_path / "in", 'def Xform "part" {\n' + mesh() + "}\n", "part.usda")

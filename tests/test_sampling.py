@@ -259,3 +259,18 @@ def test_gradients_to_colour():
 def test_wrong_arguments_are_refused_by_name(name, call, error):
     with pytest.raises(error, match=f"^{name}: expected .*, got "):
         call(agreement("opaque"))
+
+
+@pytest.mark.parametrize("backend", ["torch", "cpu"])
+@pytest.mark.parametrize(
+    "shutter", [tb.Shutter.trapezoid(0.1, 0.2, 0.7, 0.9), tb.Shutter((0.0, 0.3, 0.6, 1.0), (1.0, 0.0, 0.0, 2.0))]
+)
+def test_what_rests_is_its_sharp_image_under_any_shutter(shutter, backend):
+    wall = torch.tensor([[-9.0, -9, 0], [9, -9, 0], [0, 18, 0]])
+    camera = tb.Camera.look_at((0, 0, 3), (0, 0, 0), fov_y_deg=40, width=4, height=4, near=0.1, far=9)
+    scene = tb.Scene([tb.Mesh(wall, [[0, 1, 2]], tb.Material((0.0, 0.5, 1.0)))], camera, background=(1.0, 1.0, 1.0))
+    wanted = torch.tensor([0.0, 0.5, 1.0, 1.0]).expand(4, 4, 4)
+    for n in (1, 3, 8):
+        for name, reference in REFERENCES.items():
+            seen = reference(scene, n, shutter=shutter, backend=backend)
+            assert torch.allclose(seen, wanted, rtol=0, atol=1e-6), (name, n)

@@ -157,3 +157,24 @@ def test_the_time_of_an_event_has_its_gradient_under_any_shutter():
 def test_bad_shutters_are_refused_by_name(make, name):
     with pytest.raises((TypeError, ValueError), match=rf"^{name}: expected .*, got "):
         make()
+
+
+@pytest.mark.parametrize(
+    "shutter",
+    [
+        tb.Shutter.box(),
+        tb.Shutter.box(0.2, 0.3),
+        tb.Shutter.trapezoid(0.1, 0.2, 0.7, 0.9),
+        tb.Shutter.trapezoid(0.0, 0.5, 0.5, 1.0),
+        tb.Shutter((0.0, 0.3, 0.6, 1.0), (1.0, 0.0, 0.0, 2.0)),
+        tb.Shutter((0.0, 0.5, 1.0), (0.0, 1e-9, 1.0)),
+    ],
+)
+def test_time_of_is_the_inverse_of_the_weight_that_has_passed(shutter):
+    share = torch.linspace(0, 1, 1001, dtype=torch.float64)
+    t = shutter.time_of(share)
+    assert (t.diff() >= 0).all()
+    assert t[0] >= shutter.t_open
+    assert t[-1] <= shutter.t_close
+    passed = shutter.weight(torch.full_like(t, shutter.t_open), t, torch.zeros(1001, dtype=torch.int64))
+    assert torch.allclose(passed, share, rtol=0, atol=1e-14)

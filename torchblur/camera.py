@@ -152,7 +152,8 @@ class Camera:
             eye, target, up: as in `look_at`.
             height_world: height of the view [scene units]; pixels are square.
             width, height: image size [px].
-            near, far: view depths of the clip planes [scene units], near < far; they may be negative.
+            near, far: view depths of the clip planes [scene units], near < far; they may be negative. Faces that are
+                nearer to each other than 1e-11 of far - near count as coplanar.
 
         Raises:
             TypeError, ValueError: a wrong argument, named.

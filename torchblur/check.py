@@ -114,6 +114,14 @@ def unit_range(name: str, value: Tensor) -> Tensor:
     return value
 
 
+def at_most(name: str, value: Tensor, limit: float) -> Tensor:
+    """Return `value` unchanged if none of it is beyond `limit`, to either side."""
+    largest = float(value.detach().abs().amax()) if value.numel() else 0.0
+    if largest > limit:
+        raise fail(name, f"values of at most {limit:g}, to either side", f"{largest:g}")
+    return value
+
+
 def indices(name: str, value: Any, shape: Sequence[int | str], below: int) -> Tensor:
     """Return `value` as int64 indices of `shape`, each in [0, below); an empty list counts as no rows."""
     expected = f"{shape_text(shape)} integers"

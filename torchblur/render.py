@@ -72,7 +72,8 @@ def render(  # noqa: PLR0913  all keywords but the first
             that needs more gets it.
         backend: "torch": any device, gradients; "cpu": compiled, for scenes on the CPU without gradients; "auto": the
             compiled one where it can be and results are float32. They agree within 2e-5 but where surfaces lie in
-            one plane to about 1e-11 of their depth: which of these is in front may differ.
+            one plane to about 1e-11 of their depth (of an orthographic camera: of its far - near): which of these is
+            in front may differ.
 
     Returns:
         A frame with `rgba` (H, W, 4), `coverage` (H, W, M), `shadow` (H, W) or None, counts, timings and the plan.
@@ -117,6 +118,8 @@ def render_windows(  # noqa: PLR0913  as render, and the windows
 
     Returns:
         One frame a window, each what `render` returns for `shutter.window(start, end)`; they share counts and timings.
+        `Accuracy.linear()` and `.adaptive()` follow surfaces by chords over the time from the first window's start to
+        the last one's end, not over each window, and so give other images than `render` there.
 
     Raises:
         TypeError, ValueError: a wrong argument, named; a window in which the shutter sees nothing.

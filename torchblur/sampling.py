@@ -118,10 +118,10 @@ def stochastic(
 
     Args:
         scene: what to render.
-        samples: N a pixel: one in each of N equal parts of the exposure and, unless all are in the centre, one in each
-            of N equal rectangles of the pixel, times and places paired at random. Best where N has two factors of
-            like size.
-        shutter: weighs the samples; `Shutter.box()`, the whole exposure, if None.
+        samples: N a pixel: one in each of N parts of the exposure of equal weight and, unless all are in the centre,
+            one in each of N equal rectangles of the pixel, times and places paired at random. Best where N has two
+            factors of like size.
+        shutter: whose weight the times follow; `Shutter.box()`, the whole exposure, if None.
         places: of the rays: "area", over the pixel; "centre", as `render` with one ray.
         seed: of all that is random.
         backend: as in `accumulate`.

@@ -17,6 +17,8 @@ from torchblur.camera import Camera, lerp_knots, project_world
 from torchblur.lights import LIGHTS, Light
 from torchblur.material import Material
 
+MAX_UV = 1e6  # in float32 a step from there is a sixteenth of a texture
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -26,7 +28,7 @@ class Mesh:
         vertices: (V, 3) static, or (K+1, V, 3) at equally spaced shutter times [scene units], float32 or float64.
         faces: (F, 3) integers in [0, V).
         material: colour, opacity, texture, sides; per-face values must be F long.
-        uv: (F, 3, 2) float texture coordinates of the faces' corners; a texture needs them.
+        uv: (F, 3, 2) float texture coordinates of the faces' corners, of at most MAX_UV; a texture needs them.
         normals: (V, 3) static, or (K+1, V, 3) with the vertices' knots: directions of any length above 0 at the
             vertices, for smooth lighting; they turn linearly between knots. Without them faces are flat.
         name: for messages and metadata.
@@ -65,7 +67,7 @@ class Mesh:
             raise check.fail("opacity", f"a number or ({len(faces)},), one value a face", opacity)
         if self.uv is None and self.material.texture is not None:
             raise check.fail("uv", f"({len(faces)}, 3, 2) floats, as the material has a texture", "none")
-        uv = None if self.uv is None else check.floats("uv", self.uv, (len(faces), 3, 2))
+        uv = None if self.uv is None else check.at_most("uv", check.floats("uv", self.uv, (len(faces), 3, 2)), MAX_UV)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", faces)
         object.__setattr__(self, "uv", uv)

@@ -165,13 +165,31 @@ class Shutter:
         h = weights[k] + (t - times[k]) / times.diff()[k] * weights.diff()[k]
         return torch.where((t >= self.t_open) & (t <= self.t_close), h / area, 0.0)
 
+    def time_of(self, share: Tensor) -> Tensor:
+        """Return the shutter times (n,) of the first line until which `share` (n,) in [0, 1] of all weight has passed.
+
+        Source: the inverse of the integral of h, a square root where h rises or falls.
+        """
+        times, weights, before = self._pieces(share)
+        area = share * before[-1]
+        piece = (torch.searchsorted(before, area.detach(), right=True) - 1).clamp(0, len(times) - 2)
+        area, weight = (area - before[piece]).clamp(min=0.0), weights[piece]
+        slope = (weights.diff() / times.diff())[piece]
+        lower = weight + torch.sqrt((weight * weight + 2 * slope * area).clamp(min=0.0))
+        into = torch.where(lower > 0, 2 * area / torch.where(lower > 0, lower, 1.0), 0.0)
+        return torch.minimum(times[piece] + into, times[piece + 1])
+
+    def _pieces(self, like: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return times, weights and the area under h until each of the times (k,), as `like` is stored."""
+        times = torch.tensor(self.times, dtype=like.dtype, device=like.device)
+        weights = torch.tensor(self.weights, dtype=like.dtype, device=like.device)
+        areas = 0.5 * (weights[1:] + weights[:-1]) * times.diff()
+        return times, weights, torch.cat([areas.new_zeros(1), areas.cumsum(0)])
+
     def _integral(self, t: Tensor) -> Tensor:
         """Return H (n,) at shutter times of the first line: 0 before it opens, 1 after it closes."""
-        times = torch.tensor(self.times, dtype=t.dtype, device=t.device)
-        weights = torch.tensor(self.weights, dtype=t.dtype, device=t.device)
+        times, weights, before = self._pieces(t)
         length, rise = times.diff(), weights.diff()
-        areas = 0.5 * (weights[1:] + weights[:-1]) * length
-        before = torch.cat([areas.new_zeros(1), areas.cumsum(0)])
         t = t.clamp(self.t_open, self.t_close)
         piece = (torch.searchsorted(times, t.detach(), right=True) - 1).clamp(0, len(length) - 1)
         into = t - times[piece]

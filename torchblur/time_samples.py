@@ -35,7 +35,7 @@ HALTON_BITS = 24  # of the number of samples
 class Samples:
     """When and where P pixels are looked at."""
 
-    share: Tensor  # (N, P) float64 of the time for which a pixel's line is open, in [0, 1), rising along N
+    share: Tensor  # (N, P) float64 of the shutter's weight that has passed, in [0, 1), rising along N
     x_px: Tensor  # (N, P) or (1, 1) float64 place inside the pixel, in [0, 1)
     y_px: Tensor  # as `x_px`
     spacing_px: float  # side of the square that a ray stands for
@@ -111,7 +111,7 @@ def sum_of_samples(
     Args:
         scene: what to look at.
         surfaces: of its faces.
-        shutter: weighs the samples by its density at their times.
+        shutter: whose weight is the density of the samples' times.
         count: N.
         draw: returns the samples of so many pixels.
 
@@ -149,13 +149,11 @@ def _ranks(
     """Yield the rays and weights of pixels, columns and rows (P,) of an image of a size, rank by rank."""
     column, row, size = pixels
     line = shutter.line_of(column, row, size)
-    open_for = shutter.t_close - shutter.t_open
     for n in range(count):
         parts = samples.share, samples.x_px, samples.y_px
         share, x, y = (s[min(n, len(s) - 1)].to(column.device) for s in parts)
-        t = shutter.t_open + share * open_for
-        weight = shutter.density(t.clamp(max=shutter.t_close), torch.zeros_like(line)) * (open_for / count)
-        t = (t + shutter.line_delay * line).clamp(max=1.0)
+        t = (shutter.time_of(share) + shutter.line_delay * line).clamp(max=1.0)
+        weight = torch.full_like(t, 1 / count)
         yield SampleRays(t, column + x, row + y, int(row[0]), samples.spacing_px), weight
 
 

@@ -16,7 +16,7 @@ from kornia.filters import motion_blur
 from kornia.geometry.transform import remap
 from torch import Tensor
 
-from datagen.baselines.views import STILL_PX, View
+from datagen.baselines.views import STILL_PX, View, checked_images
 from torchblur import check
 
 MAX_LENGTH_PX = 4095
@@ -38,7 +38,7 @@ def directional_image(color: Any, motion_px: Any) -> Tensor:
     Gradient: to colour.
     Source: kornia's `motion_blur`, of equal weight along the line.
     """
-    image = check.floats("color", color, ("B", "C", "H", "W"))
+    image = checked_images(color)
     motion = check.floats("motion_px", motion_px, (len(image), 2)).detach()
     check.same_device(color=image, motion_px=motion)
     length = torch.linalg.vector_norm(motion, dim=1)
@@ -76,7 +76,7 @@ def directional(color: Any, motion_px: Any, *, samples: int = 32) -> Tensor:
     Gradient: to colour and motion.
     Source: ours. Motions of 1 px and less blur nothing.
     """
-    image = check.floats("color", color, ("B", "C", "H", "W"))
+    image = checked_images(color)
     motion = View(image, motion_px, torch.ones_like(image[:, :1])).motion_px
     check.positive_int("samples", samples, MAX_TAPS)
     h, w = image.shape[-2:]

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from datagen.baselines.curves import Curves, fit_curves
-from datagen.baselines.views import Layer, Paths
+from datagen.baselines.views import Layer, Paths, checked_images
 from torchblur import check, packed
 
 WEIGHTINGS = ("published", "time")
@@ -93,7 +93,7 @@ def guertin2015(
         pixel and less from the sharp instant are not scattered. Trails are hidden by what is nearer than they are, by
         more than DEPTH_BIAS of the depth.
     """
-    image = check.floats("color", color, ("B", "C", "H", "W"))
+    image = checked_images(color)
     if not isinstance(paths, Paths):
         raise check.fail_type("paths", "Paths", paths)
     if weighting not in WEIGHTINGS:

@@ -21,6 +21,20 @@ STILL_PX = 0.5  # a point that is displaced by no more than this from the sharp 
 SHARP_TIME = 0.5  # shutter time of the sharp image
 
 
+def checked_images(color: Any) -> Tensor:
+    """Return images (B, C, H, W) of at least one channel and one pixel; the batch may be empty.
+
+    Raises:
+        TypeError, ValueError: another shape or type, NaN or inf.
+
+    Source: ours.
+    """
+    images = check.floats("color", color, ("B", "C", "H", "W"))
+    if 0 in images.shape[1:]:
+        raise check.fail("color", "(B, C, H, W) with at least one channel and one pixel", images)
+    return images
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """A batch of sharp images with the motion and depth of what they show.
@@ -39,7 +53,7 @@ class View:
     depth_view: Tensor
 
     def __post_init__(self) -> None:
-        color = check.floats("color", self.color, ("B", "C", "H", "W"))
+        color = checked_images(self.color)
         b, _, h, w = color.shape
         motion = check.floats("motion_px", self.motion_px, (b, 2, h, w))
         depth = _depth("depth_view", self.depth_view, (b, 1, h, w))
@@ -106,7 +120,7 @@ class Layer:
     depth_view: Tensor
 
     def __post_init__(self) -> None:
-        color = check.floats("color", self.color, ("B", "C", "H", "W"))
+        color = checked_images(self.color)
         b, _, h, w = color.shape
         depth = _depth("depth_view", self.depth_view, (b, 1, h, w))
         _same_kind(color=color, depth_view=depth)

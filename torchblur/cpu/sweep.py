@@ -26,6 +26,7 @@ T_START, T_END, NUM, DEN, LOW, HIGH, N_NUMBERS = 0, 1, 2, 6, 10, 11, 12
 PRISM, RANK, IS_OPAQUE, UPPER, N_MARKS = 0, 1, 2, 3, 4
 N_CROSSING = 7  # coefficients of a difference of two nearnesses
 NO_ROOM = -1
+MANY = 64  # intervals that start at once
 
 
 class Ray(NamedTuple):
@@ -123,6 +124,26 @@ def _precedes(ray: Ray, i: int, j: int, cell: tuple[float, float]) -> bool:
     if ray.data[j, LOW] > ray.data[i, HIGH]:
         return False
     return _is_in_front(ray, i, j, cell)
+
+
+@inlined
+def _drop_ended(data: np.ndarray, active: np.ndarray, n: int, now: float) -> int:
+    """Take out of the active intervals those that end by `now`, and return how many are left."""
+    left = 0
+    for k in range(n):
+        own = active[k]
+        if data[own, T_END] > now:
+            active[left] = own
+            left += 1
+    return left
+
+
+@inner
+def _sort_roughly(data: np.ndarray, active: np.ndarray, n: int) -> None:
+    """Put active intervals in order of their least nearness, so that `_order` has little to move where many start."""
+    sort_by(data, LOW, active, n)
+    for k in range(n // 2):
+        active[k], active[n - 1 - k] = active[n - 1 - k], active[k]
 
 
 @inlined
@@ -251,18 +272,17 @@ def sweep(ray: Ray, n: int, cells: Cells, shortest: float, solver: Solver) -> tu
     sort_by(data, T_END, by_end, n)
     now, next_start, next_end, n_active = data[0, T_START], 0, 0, 0
     while True:
-        while next_end < n and data[by_end[next_end], T_END] <= now:
-            gone, place = by_end[next_end], 0
-            while active[place] != gone:
-                place += 1
-            for k in range(place, n_active - 1):
-                active[k] = active[k + 1]
-            n_active -= 1
-            next_end += 1
+        if next_end < n and data[by_end[next_end], T_END] <= now:
+            n_active = _drop_ended(data, active, n_active, now)
+            while next_end < n and data[by_end[next_end], T_END] <= now:
+                next_end += 1
+        n_before = n_active
         while next_start < n and data[next_start, T_START] <= now:
             active[n_active] = next_start
             n_active += 1
             next_start += 1
+        if n_active - n_before >= MANY:
+            _sort_roughly(data, active, n_active)
         if next_end == n:
             return n_cells, n_crossings
         event = data[by_end[next_end], T_END]

@@ -34,8 +34,12 @@ from datagen.baselines.filters import FILTERS
 from datagen.baselines.guertin2015 import guertin2015
 from datagen.baselines.views import find_paths, find_view
 from datagen.colour import srgb_from_linear
+from datagen.pictures import decode_png
+from datagen.writer import write_atomically
 
 RESULTS_NAME = "results.json"
+RECORD = {"check", "check_times", "methods", "looks_per_pixel", "intervals_per_pixel", "cpu_s"}
+SMALLEST_PX = 16  # SSIM needs 11
 SCENES: dict[str, Callable[[int], tb.Scene]] = {
     **paper_scenes.SCENES,
     **filter_scenes.SCENES,
@@ -160,12 +164,29 @@ def measure(scene: tb.Scene, settings: dict[str, Any]) -> tuple[dict[str, Any], 
 
 def read_results(path: Path, settings: dict[str, Any]) -> dict[str, Any]:
     """Return what an earlier run with the same settings has stored, or a fresh record."""
-    if path.exists():
+    if not path.exists():
+        return {"settings": settings, "scenes": {}}
+    try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        if found["settings"] == settings:
-            return found
+        every = [row["time_s"] for record in found["scenes"].values() for row in record["methods"].values()]
+        is_whole = all(isinstance(time_s, float) for time_s in every) and isinstance(found["settings"], dict)
+        is_whole = is_whole and all(record.keys() >= RECORD for record in found["scenes"].values())
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        is_whole = False
+    if not is_whole:
+        raise SystemExit(f"out: expected the results of an earlier run, got {path} damaged; without it all starts anew")
+    if found["settings"] != settings:
         raise SystemExit(f"out: expected a folder for {settings}, got {path} of {found['settings']}")
-    return {"settings": settings, "scenes": {}}
+    return found
+
+
+def is_picture(path: Path) -> bool:
+    """Return whether a file is there and a whole PNG."""
+    try:
+        decode_png(path.read_bytes())
+    except (OSError, SyntaxError):  # cut short, or no picture
+        return False
+    return True
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -176,6 +197,12 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--repeats", type=int, default=1, help="turns that are timed")
     parser.add_argument("--quick", action="store_true", help="fewer scenes and counts, smaller images")
     arguments = parser.parse_args(argv)
+    if arguments.size is not None and arguments.size < SMALLEST_PX:
+        parser.error(f"--size: expected at least {SMALLEST_PX}, got {arguments.size}")
+    if arguments.repeats < 1:
+        parser.error(f"--repeats: expected at least 1, got {arguments.repeats}")
+    if arguments.out.exists() and not arguments.out.is_dir():
+        parser.error(f"--out: expected a folder, got the file {str(arguments.out)!r}")
     size = arguments.size or (96 if arguments.quick else 128)
     counts, names = (QUICK_COUNTS, QUICK_SCENES) if arguments.quick else (COUNTS, tuple(SCENES))
     settings = {"size_px": size, "counts": list(counts), "repeats": arguments.repeats, "torch": torch.__version__}
@@ -186,7 +213,7 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     for k, name in enumerate(names):
         sheet = arguments.out / f"{accuracy_page.file_name(name)}.png"
-        if name in results["scenes"] and sheet.exists():
+        if name in results["scenes"] and is_picture(sheet):
             print(f"{k + 1}/{len(names)} {name}: kept", file=sys.stderr)
             continue
         print(f"{k + 1}/{len(names)} {name} ...", file=sys.stderr)
@@ -194,11 +221,9 @@ def main(argv: list[str] | None = None) -> None:
         warm_up(scene, single(SCENES[name](16)))
         record, images = measure(scene, settings)
         shown = {method: images[method] for method in SHOWN if method in images}
-        sheet.write_bytes(accuracy_page.encode_sheet(shown))
+        write_atomically(sheet, accuracy_page.encode_sheet(shown))
         results["scenes"][name] = record
-        partial = place.with_suffix(".part")
-        partial.write_text(json.dumps(results, indent=1), encoding="utf-8")
-        partial.replace(place)
+        write_atomically(place, json.dumps(results, indent=1).encode())
     page = accuracy_page.write_page(arguments.out, results)
     print(f"{sum(r['cpu_s'] for r in results['scenes'].values()):.0f} s of CPU time in all", file=sys.stderr)
     print(page)

@@ -91,6 +91,41 @@ def test_an_interrupted_run_goes_on_with_the_next_scene(tiny, tmp_path, monkeypa
         accuracy_vs_time.main(["--out", str(tmp_path), "--quick", "--size", "24"])
 
 
+@pytest.mark.parametrize(
+    "text", ["", "{}", "[]", '{"scenes": {"rotor": {}}}', '{"settings": {}, "scenes": {"rotor": {}}}', "\xff"]
+)
+def test_damaged_results_are_told_and_kept(tiny, tmp_path, text):
+    (tmp_path / "results.json").write_bytes(text.encode("latin-1"))
+    with pytest.raises(SystemExit, match=r"out: expected the results of an earlier run, got .*results\.json damaged"):
+        accuracy_vs_time.main(["--out", str(tmp_path), "--quick", "--size", "20"])
+    assert (tmp_path / "results.json").read_bytes() == text.encode("latin-1")
+
+
+def test_a_damaged_sheet_is_made_once_more(page, capsys):
+    sheet = page.parent / "pills.png"
+    whole = sheet.read_bytes()
+    for cut in (0, len(whole) // 2):
+        sheet.write_bytes(whole[:cut])
+        accuracy_vs_time.main(["--out", str(page.parent), "--quick", "--size", "20"])
+        told = capsys.readouterr().err
+        assert "swapping quads: kept" in told
+        assert "pills: kept" not in told
+        assert accuracy_vs_time.is_picture(sheet)
+
+
+@pytest.mark.parametrize("words", [["--size", "0"], ["--size", "10"], ["--size", "-5"], ["--repeats", "0"]])
+def test_wrong_arguments_are_named_before_any_work(tmp_path, capsys, words):
+    with pytest.raises(SystemExit) as stop:
+        accuracy_vs_time.main(["--out", str(tmp_path / "out"), *words])
+    assert stop.value.code == 2
+    assert f"{words[0]}: expected at least" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(SystemExit):
+        accuracy_vs_time.main(["--out", str(tmp_path / "file")])
+    assert "--out: expected a folder, got the file" in capsys.readouterr().err
+
+
 def test_the_page_holds_all_that_it_shows(page):
     text = page.read_text()
     assert text.count("<img ") == 1 + 2 * 2

@@ -1,6 +1,7 @@
 """The scatter filter of 2015 against a plain transcription, closed forms of its curves and weights, and exact blur."""
 
 import math
+import time
 
 import filter_transcriptions as plain
 import numpy as np
@@ -15,6 +16,12 @@ from datagen.baselines.views import Layer, Paths, find_paths, find_view
 F64 = torch.float64
 THREE, FOUR = (0.0, 0.5, 1.0), (0.0, 0.25, 0.5, 1.0)
 H, W = 10, 13
+
+
+def whole_bound(curves):
+    """The bound of the speed over all of the exposure, (n,)."""
+    n = len(curves.control)
+    return curves.speed_bound(torch.arange(n), torch.zeros(n, dtype=F64), torch.ones(n, dtype=F64))
 
 
 def random_paths(generator, times=THREE, batch=1, reach=6.0, h=H, w=W):
@@ -74,7 +81,7 @@ def sample_counts(paths, curve):
     for y, x in moving.nonzero().tolist():
         points = torch.cat([paths.offset_px[0, :, :, y, x], paths.depth_view[0, :, y, x, None]], dim=1).unsqueeze(0)
         points = points + torch.tensor([x + 0.5, y + 0.5, 0.0], dtype=F64)
-        counts[y, x] = math.ceil(2 * float(fit_curves(points, paths.times, curve).speed_bound()))
+        counts[y, x] = math.ceil(2 * float(whole_bound(fit_curves(points, paths.times, curve))))
     return counts.tolist()
 
 
@@ -100,7 +107,7 @@ def test_curves_pass_through_their_points(generator, times, kind):
     for k, t in enumerate(times):
         torch.testing.assert_close(curves.at(every, torch.full((200,), t, dtype=F64)), points[:, k], rtol=0, atol=1e-7)
     fine = torch.linspace(0, 1, 401, dtype=F64)
-    bound = curves.speed_bound()
+    bound = whole_bound(curves)
     for n in range(0, 200, 20):
         place = curves.at(torch.full((401,), n), fine)[:, :2]
         assert float(torch.linalg.vector_norm(place.diff(dim=0), dim=1).max()) * 400 <= float(bound[n]) * (1 + 1e-9)
@@ -119,7 +126,7 @@ def test_an_arc_follows_a_rotation_at_its_speed(turn):
     for s in np.linspace(0, 1, 9):
         found = curves.at(torch.tensor([0]), torch.tensor([s], dtype=F64))[0]
         torch.testing.assert_close(found, place(s), rtol=0, atol=1e-9)
-    assert float(curves.speed_bound()) == pytest.approx(14 * abs(turn))
+    assert float(whole_bound(curves)) == pytest.approx(14 * abs(turn))
 
 
 def test_points_on_a_line_make_no_arc():
@@ -365,3 +372,48 @@ def test_wrong_arguments_are_refused_by_name(name, given, error):
 def test_wrong_parts_are_refused_by_name(name, make):
     with pytest.raises((TypeError, ValueError), match=f"^{name}: expected .*, got "):
         make()
+
+
+@pytest.mark.parametrize(("times", "curve"), [(THREE, "bezier"), (THREE, "arc"), (FOUR, "bezier")])
+def test_speeds_stay_below_their_bound_in_each_piece(generator, times, curve):
+    curves = fit_curves(20 * torch.rand(200, len(times), 3, generator=generator, dtype=F64), times, curve)
+    which = torch.arange(200)
+    start, end = torch.sort(torch.rand(2, 200, generator=generator, dtype=F64), dim=0).values
+    bound, seen = curves.speed_bound(which, start, end), torch.zeros(200, dtype=F64)
+    for k in range(64):
+        a, b = (start + (end - start) * (k + n) / 64 for n in (0, 1))
+        moved = (curves.at(which, b) - curves.at(which, a))[:, :2].norm(dim=1)
+        assert (moved <= bound * (b - a) * (1 + 1e-9) + 1e-12).all()
+        seen = torch.maximum(seen, moved / (b - a))
+    assert (bound <= 4.0 * seen).all()  # about the speed itself, but for the bend of a cubic
+
+
+@pytest.mark.parametrize("curve", ["bezier", "arc"])
+def test_what_moves_far_outside_adds_the_time_that_it_spends_inside(curve):
+    """Points that come from far away: the whole way is not sampled, but what is inside of the image is, evenly."""
+    reach = 60_000.0
+    offset = torch.zeros(1, 3, 2, 1, 9, dtype=F64)
+    offset[0, 0, 0], offset[0, 2, 0], offset[0, 2, 1] = -reach, 3.0, 1e-3
+    depth = torch.full((1, 3, 1, 9), torch.inf, dtype=F64)
+    depth[..., 4] = 1.0
+    color = torch.ones(1, 1, 1, 9, dtype=F64)
+    color[..., 4] = 5.0
+    seen = guertin2015(color, Paths(offset * torch.isfinite(depth).unsqueeze(2), depth), curve=curve, weighting="time")
+    points = torch.cat([offset[0, :, :, 0, 4] + torch.tensor([4.5, 0.5]), torch.ones(3, 1, dtype=F64)], 1).unsqueeze(0)
+    t = (torch.arange(4_000_000, dtype=F64) + 0.5) / 4_000_000
+    place = fit_curves(points, THREE, curve).at(torch.zeros(len(t), dtype=torch.int64), t)
+    inside = (place[:, 0] >= 0) & (place[:, 0] < 9) & (place[:, 1] >= 0) & (place[:, 1] < 1)
+    share = torch.bincount(place[inside, 0].long(), minlength=9) / len(t)
+    others = [0, 1, 2, 3, 5, 6, 7, 8]  # its own pixel has its colour anyway
+    added, wanted = (seen[0, 0, 0, others] - 1) / 4, share[others].to(F64)
+    assert float(added.sum()) == pytest.approx(float(wanted.sum()), rel=0.05)
+    assert ((added / wanted - 1).abs() < 0.6).all()  # of 2 samples a pixel or so
+
+
+@pytest.mark.parametrize("curve", ["bezier", "arc"])
+def test_motion_of_any_length_takes_no_time(generator, curve):
+    began = time.process_time()
+    for reach in (1e6, 1e12, 1e30):
+        paths = random_paths(generator, reach=reach)
+        assert torch.isfinite(guertin2015(random_color(generator), paths, curve=curve, weighting="time")).all()
+    assert time.process_time() - began < 60

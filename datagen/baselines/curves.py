@@ -42,13 +42,15 @@ class Curves:
         xy = torch.where(self.is_arc[curve].unsqueeze(1), self.centre[curve] + turned, place[:, :2])
         return torch.cat([xy, place[:, 2:]], dim=1)
 
-    def speed_bound(self) -> Tensor:
-        """Return (n,) a bound of the speed on screen [px per exposure]."""
-        degree = self.control.shape[1] - 1
-        bound = degree * torch.linalg.vector_norm(self.control[..., :2].diff(dim=1), dim=2).amax(1)
+    def speed_bound(self, curve: Tensor, start: Tensor, end: Tensor) -> Tensor:
+        """Return (m,) a bound of the speed on screen [px per exposure] of the curves numbered `curve` (m,) between the
+        shutter times `start` and `end` (m,).
+        """
+        bound = torch.linalg.vector_norm(_slopes(self.control[curve, :, :2], start, end), dim=2).amax(1)
         if not len(self.centre):
             return bound
-        return torch.where(self.is_arc, degree * self.radius * self.angle.diff(dim=1).abs().amax(1), bound)
+        turning = _slopes(self.angle[curve].unsqueeze(2), start, end)[..., 0].abs().amax(1)
+        return torch.where(self.is_arc[curve], self.radius[curve] * turning, bound)
 
 
 def fit_curves(points: Tensor, times: tuple[float, ...], kind: str) -> Curves:
@@ -97,6 +99,21 @@ def bernstein_basis(s: Tensor, count: int) -> Tensor:
     """Return (m, count) the Bernstein polynomials of degree count - 1 at `s` (m,)."""
     n = count - 1
     return torch.stack([math.comb(n, j) * s**j * (1 - s) ** (n - j) for j in range(count)], dim=1)
+
+
+def _slopes(control: Tensor, start: Tensor, end: Tensor) -> Tensor:
+    """Return (m, K - 1, d) the control values of the derivative of Bezier curves (m, K, d) between two times (m,)."""
+    slopes = (control.shape[1] - 1) * control.diff(dim=1)
+    ends = [t.reshape(-1, 1, 1) for t in (start, end)]
+    n = slopes.shape[1]
+    found = []
+    for k in range(n):  # blossoms: the times k times the end, else the start
+        part = slopes
+        for m in range(n - 1):
+            t = ends[m < k]
+            part = (1 - t) * part[:, :-1] + t * part[:, 1:]
+        found.append(part[:, 0])
+    return torch.stack(found, dim=1)
 
 
 def _solve(values: Tensor, times: tuple[float, ...]) -> Tensor:

@@ -27,6 +27,7 @@ WEIGHTINGS = ("published", "time")
 DEPTH_BIAS = 0.01  # share of the depth by which a trail may lie behind a surface and still be seen: its own
 GRID_PX = 1 / 256  # to which the ends of lines are rounded, as graphics hardware does
 TIME_SAMPLES_PER_PX = 2.0  # of a curve's length, at its fastest
+WHOLE_PX, PIECE_PX = 2048.0, 64.0  # length of a curve from which on it is cut, and of a piece that is not cut further
 MAX_FRAGMENTS = 1 << 21  # handled together
 
 
@@ -113,7 +114,11 @@ def guertin2015(
         below_depth = torch.where(stays, depth, below_depth)
     curves, pixel = _trails(paths, moving, curve)
     settings = Lines() if lines is None else lines
-    trails = _time_fragments(curves) if weighting == "time" else _line_fragments(curves, settings, moving.shape[1:])
+    trails = (
+        _time_fragments(curves, moving.shape[1:])
+        if weighting == "time"
+        else _line_fragments(curves, settings, moving.shape[1:])
+    )
     light, alpha = _scatter(image, pixel, below_depth.detach(), trails)
     if weighting == "time":
         return (light + (1 - alpha).clamp(min=0) * below) / alpha.clamp(min=1)
@@ -170,14 +175,38 @@ def _line_fragments(curves: Curves, lines: Lines, size: tuple[int, int]) -> Iter
         start = end
 
 
-def _time_fragments(curves: Curves) -> Iterator[_Fragments]:
-    """Yield points at the middles of equal parts of the exposure, each weighing its part."""
-    count = torch.ceil(TIME_SAMPLES_PER_PX * curves.speed_bound()).clamp(min=1).long()
+def _time_fragments(curves: Curves, size: tuple[int, int]) -> Iterator[_Fragments]:
+    """Yield points at the middles of equal parts of pieces of the exposure, each weighing its part.
+
+    A piece is the exposure; or, of a long curve, a part in which it may be inside the image, of height and width
+    `size`.
+    """
+    which = torch.arange(len(curves.control), device=curves.control.device)
+    start = torch.zeros(len(which), dtype=torch.float64, device=which.device)
+    end, most_px = torch.ones_like(start), WHOLE_PX
+    while len(which):
+        length_px = curves.speed_bound(which, start, end) * (end - start)
+        is_short = length_px <= most_px
+        yield from _even_fragments(curves, *(part[is_short] for part in (which, start, end, length_px)))
+        middle, reach = 0.5 * (start + end), 0.5 * length_px
+        x, y, _ = curves.at(which, middle).unbind(1)
+        is_seen = (x >= -reach) & (x <= size[1] + reach) & (y >= -reach) & (y <= size[0] + reach)
+        kept = is_seen & ~is_short & (start < middle) & (middle < end)  # else shorter than times are rounded to
+        which, start, middle, end = (part[kept] for part in (which, start, middle, end))
+        which, start, end = torch.cat([which, which]), torch.cat([start, middle]), torch.cat([middle, end])
+        most_px = PIECE_PX
+
+
+def _even_fragments(
+    curves: Curves, curve: Tensor, start: Tensor, end: Tensor, length_px: Tensor
+) -> Iterator[_Fragments]:
+    """Yield points of pieces (m,) of curves at the middles of equal parts of their times."""
+    count = torch.ceil(TIME_SAMPLES_PER_PX * length_px).clamp(min=1).long()
     for part in _portions(count):
-        rank, which = packed.expand(torch.zeros_like(count[part]), count[part])
-        which = which + part.start
-        weight = 1 / count[which].to(torch.float64)
-        yield _Fragments(which, curves.at(which, (rank + 0.5) * weight), weight)
+        rank, piece = packed.expand(torch.zeros_like(count[part]), count[part])
+        piece = piece + part.start
+        weight = (end - start)[piece] / count[piece]
+        yield _Fragments(curve[piece], curves.at(curve[piece], start[piece] + (rank + 0.5) * weight), weight)
 
 
 def _portions(count: Tensor) -> Iterator[slice]:

@@ -44,6 +44,7 @@ def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray: Ray) -> Ite
     size = camera.width, camera.height, camera.height
     clip: list[Tensor] = []
     pending: list[tuple[Tensor, Tensor]] = []
+    n_pending = 0
     for k in range(len(t)):
         shape = _still(vertices_at(knots, float(t[k])), corner, n_faces)
         clip.append(torch.from_numpy(shape.clip_start))
@@ -51,9 +52,10 @@ def find_fragments(scene: Scene, surfaces: Surfaces, t: Tensor, ray: Ray) -> Ite
         seen = on_threads(lambda rows, shape=shape: layers.find_visible(shape, faces, rays, rows), bands_of(size[1]))
         for pixel, face, _ in seen:
             pending.append((torch.from_numpy(pixel), torch.from_numpy(face) + k * n_faces))
-            if sum(len(p) for p, _ in pending) > MAX_PAIRS:
+            n_pending += len(pixel)
+            if n_pending > MAX_PAIRS:
                 yield _fragments(scene, surfaces, (torch.stack(clip), corner), pending, (t, ray))
-                pending = []
+                pending, n_pending = [], 0
     if pending:
         yield _fragments(scene, surfaces, (torch.stack(clip), corner), pending, (t, ray))
 

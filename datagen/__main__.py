@@ -6,6 +6,7 @@ Starting the same command again finishes what is missing. The exit codes are in 
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -106,7 +107,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     Source: ours.
     """
     try:
-        return _run_words(list(sys.argv[1:] if argv is None else argv))
+        code = _run_words(list(sys.argv[1:] if argv is None else argv))
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # who reads has read enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_DONE
     except KeyboardInterrupt:
         print("interrupted; the same command finishes the rest", file=sys.stderr)
         return EXIT_INTERRUPTED

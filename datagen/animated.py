@@ -20,7 +20,7 @@ from datagen.assets import SMALLEST_EXTENT, check_geometry, file_state, has_area
 from datagen.formats import MeshError, Surface, short_reason
 from datagen.gltf import GltfFile
 from datagen.gltf_rigs import read_rig
-from datagen.motions import RigidMotion
+from datagen.motions import MAX_KINKS, RigidMotion
 from datagen.rigs import Rig, Take
 from datagen.usd_files import USD_SUFFIXES, UsdMeshes, read_usd
 
@@ -30,7 +30,6 @@ EVEN_PROBES = 33  # instants at which an animation is measured, beside its keys
 KEY_PROBES = 64  # at most that many keys
 AT_ONCE = 1_000_000  # vertices of all instants that are held at a time; bounds the memory at about 100 MB
 SAME_POSE = 1e-3  # share of the radius by which the last pose may differ from the first in a round
-MAX_KINKS = 64  # in one exposure; beyond it no number of segments would follow them
 SHORTEST_S = 1e-3  # a shorter animation stands still: it would play faster than any shutter
 
 

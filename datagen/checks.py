@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.entries import is_sharded, read_entries
-from datagen.folders import RUN_NAME, encode_run, read_run, read_whole_run, record_sum
+from datagen.folders import RUN_NAME, RecordError, encode_run, read_run, read_whole_run, record_sum
 from datagen.listed_files import file_damage, is_of_configuration
 from datagen.manifest import MANIFEST_NAME, ManifestError, encode_entry, scan_manifest
 from datagen.report import SHEET_NAME
@@ -58,7 +58,7 @@ def verify_dataset(folder: str | Path) -> list[str]:
         if record_sum(run) != run.get("record_sha256") or encode_run(run) != (folder / RUN_NAME).read_bytes():
             problems.append(f"{RUN_NAME}: expected a record with its checksum, got another")
         spec, config = recorded_spec(run["spec"]), run["config_sha256"]
-    except (SpecError, KeyError) as error:
+    except (SpecError, RecordError, KeyError) as error:
         problems.append(f"{RUN_NAME}: expected the record of a run, got one that is missing or damaged ({error})")
         spec, config = None, None
     if is_sharded(folder):

@@ -150,7 +150,10 @@ class Report:
 
         if not read_status(self.folder).finished:
             return tell_usage([f"folder: expected at least one finished frame, got none in {self.folder!r}"])
-        print(write_page(self.folder, Path(self.folder) / "report.html" if self.out is None else self.out))
+        place = Path(self.folder) / "report.html" if self.out is None else Path(self.out)
+        if not place.parent.is_dir() or place.is_dir():
+            return tell_usage([f"out: expected a file in a folder that is there, got {self.out!r}"])
+        print(write_page(self.folder, place))
         return EXIT_DONE
 
 
@@ -219,8 +222,10 @@ def run_command(command: Any) -> int:
         return command.run()
     except SpecError as error:
         return tell_usage(error.problems)
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         return tell_usage([f"expected a data set, got none: {error.filename or error}"])
+    except BrokenPipeError:
+        raise
     except (RecordError, FrameFileError) as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_DAMAGED

@@ -97,12 +97,13 @@ def export_dataset(
         "flow_suffix": suffix,
         "config_sha256": run["config_sha256"],
         "torchblur_version": run["torchblur_version"],
+        "frames": len(entries),
         "conventions": CONVENTIONS | (CAMERA_CONVENTIONS if has_camera else LIGHT_CONVENTIONS),
     }
-    _claim(out, record)
+    _claim(out, record, len(entries))
     job = _Job(folder, out, form, split, suffix, entries, has_camera)
     files = _write_files(job) + _write_stores(job, run) + _write_list(job, run)
-    _write_record(out, record | {"frames": len(entries), "files": files, "is_finished": True})
+    _write_record(out, record | {"files": files, "is_finished": True})
     return ExportResult(out, len(entries), files)
 
 
@@ -144,7 +145,7 @@ def _data_problems(run: dict[str, Any], entries: dict[int, dict[str, Any]], form
     return problems
 
 
-def _claim(out: Path, record: dict[str, Any]) -> None:
+def _claim(out: Path, record: dict[str, Any], frames: int) -> None:
     """Create the folder and write its record, or raise if it holds something else."""
     place = out / RECORD_NAME
     try:
@@ -157,9 +158,11 @@ def _claim(out: Path, record: dict[str, Any]) -> None:
             problems = [
                 f"{name}: expected {found.get(name)!r} as in {out}, got {value!r}"
                 for name, value in record.items()
-                if name != "conventions" and found.get(name) != value
+                if name not in ("conventions", "frames") and found.get(name) != value
             ]
-        except (OSError, ValueError, AttributeError):
+            if found.get("frames", 0) > frames:
+                problems.append(f"folder: expected at least the {found['frames']} frames of {out}, got {frames}")
+        except (OSError, ValueError, AttributeError, TypeError):
             problems = [f"out: expected a readable {RECORD_NAME}, got {str(place)!r} damaged"]
         if problems:
             raise ExportError(problems)

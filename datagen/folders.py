@@ -138,7 +138,7 @@ def settle_storage(spec: DatasetSpec, folder: Path) -> DatasetSpec:
         return spec
     try:
         storage = read_run(folder)["spec"].get("storage", "folder")
-    except SpecError:  # what is there tells, too
+    except (SpecError, RecordError):  # what is there tells, too
         held = (name for name in (SHARD_FOLDER, *FOLDERS) if next((folder / name).glob("[0-9]*"), None))
         by_count = SHARD_FOLDER if spec.count >= SHARDS_FROM else FOLDERS[0]
         storage = "shards" if next(held, by_count) == SHARD_FOLDER else "folder"
@@ -164,8 +164,8 @@ def check_run(folder: Path, plan: Plan, is_borne_out: Callable[[], bool | None])
             record = read_run(folder)
             is_whole = record.get("record_sha256") == record_sum(record)
             problems = _differences(record, _run_record(plan), folder)
-        except SpecError as error:
-            is_whole, problems = False, error.problems
+        except RecordError as error:
+            is_whole, problems = False, [str(error)]
         except (TypeError, ValueError):  # values of other types than were written
             is_whole, problems = False, [f"out: expected a readable {RUN_NAME}, got {str(folder / RUN_NAME)!r} damaged"]
         if is_whole and problems:
@@ -194,7 +194,8 @@ def read_run(folder: str | Path) -> dict[str, Any]:
     """Return what `run.json` of a data set holds.
 
     Raises:
-        SpecError: it is missing or damaged.
+        SpecError: it is missing.
+        RecordError: it is damaged.
 
     Source: ours.
     """
@@ -207,7 +208,7 @@ def read_run(folder: str | Path) -> dict[str, Any]:
         raise SpecError([f"folder: expected a data set with its {RUN_NAME}, got none in {str(folder)!r}"]) from None
     except (OSError, ValueError, KeyError, TypeError, RecursionError):
         pass
-    raise SpecError([f"out: expected a readable {RUN_NAME}, got {str(path)!r} damaged"])
+    raise RecordError(f"out: expected a readable {RUN_NAME}, got {str(path)!r} damaged")
 
 
 def read_whole_run(folder: str | Path) -> dict[str, Any]:

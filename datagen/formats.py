@@ -89,8 +89,12 @@ def check_size(path: Path) -> None:
         raise MeshError(path, f"expected 1 to {MAX_FILE_BYTES} bytes, got {size}")
 
 
-def read_checked(path: Path) -> tuple[bytes, tuple[str, ...]]:
+def read_checked(path: Path, has_limits: bool = False) -> tuple[bytes, tuple[str, ...]]:
     """Return the bytes of a mesh file, its text made UTF-8, and notes on what in it is not read.
+
+    Args:
+        path: of the file.
+        has_limits: what reads the bytes next bounds by itself how much it holds, and how deep it goes.
 
     Raises:
         MeshError: its size, a file cut short or damaged in a way that shows, or a need for what is not read.
@@ -104,7 +108,7 @@ def read_checked(path: Path) -> tuple[bytes, tuple[str, ...]]:
         raise MeshError(path, f"expected a readable file, got {short_reason(error)}") from None
     suffix = path.suffix.lower()
     if suffix in (".glb", ".gltf"):
-        return data, _gltf_notes(path, data)
+        return data, _gltf_notes(path, data, has_limits)
     if suffix == ".obj":
         _check_last_face(path, data)
         if re.search(rb"^[ \t]*f[ \t](?:[^\n]*[ \t])?0+(?:[/\s]|$)", data, re.M):
@@ -163,7 +167,7 @@ def _is_text_stl(path: Path, data: bytes) -> bool:
     raise MeshError(path, f"expected {expected} bytes for the {count} triangles its header announces, got {len(data)}")
 
 
-def _gltf_notes(path: Path, data: bytes) -> tuple[str, ...]:
+def _gltf_notes(path: Path, data: bytes, has_limits: bool) -> tuple[str, ...]:
     """Refuse glTF files that need an extension or a place that is not read; return notes on animations."""
     try:
         if path.suffix.lower() == ".glb" and len(data) >= 20:
@@ -183,8 +187,9 @@ def _gltf_notes(path: Path, data: bytes) -> tuple[str, ...]:
     remote = [u for u in places if re.match(r"\s*([a-z][a-z0-9+.-]*:|//)", u, re.I) and not u.startswith("data:")]
     if remote:
         raise MeshError(path, f"expected buffers and images in files beside it, got {remote[0][:80]!r}")
-    _check_numbers(path, tree)
-    _check_nodes(path, tree)
+    if not has_limits:
+        _check_numbers(path, tree)
+        _check_nodes(path, tree)
     still = [k for k in ("animations", "skins") if tree.get(k)]
     return (f"{' and '.join(still)} in the file are not read: the mesh keeps its rest pose",) if still else ()
 

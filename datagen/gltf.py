@@ -33,7 +33,7 @@ class GltfFile:
     """
 
     def __init__(self, path: Path) -> None:
-        data, _ = read_checked(path)
+        data, _ = read_checked(path, has_limits=True)
         self.path = path
         self.tree, self._binary = _split(path, data)
         self.picture: tuple[int, np.ndarray] | None = None  # the last one that was decoded, and its number

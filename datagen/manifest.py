@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torchblur as tb
-from datagen.folders import SHARD_FOLDER, RecordError, check_run, drop_empty, sweep, write_run
+from datagen.folders import RUN_NAME, SHARD_FOLDER, RecordError, check_run, drop_empty, sweep, write_run
 from datagen.listed_files import entry_damage, is_listed, is_of_configuration
 from datagen.scenes import Plan
 from datagen.spec import BASELINES, SpecError
@@ -122,8 +122,21 @@ def encode_entry(entry: dict[str, Any]) -> bytes:
 
 
 def scan_manifest(folder: Path) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the entries in the order of their lines, and a note on each line that is none. Source: ours."""
-    lines = (folder / MANIFEST_NAME).read_bytes().split(b"\n")
+    """Return the entries in the order of their lines, and a note on each line that is none.
+
+    Raises:
+        FileNotFoundError: no data set there.
+        ManifestError: a data set without its manifest.
+
+    Source: ours.
+    """
+    try:
+        lines = (folder / MANIFEST_NAME).read_bytes().split(b"\n")
+    except FileNotFoundError:
+        if not (folder / RUN_NAME).exists():
+            raise
+        wanted = f"expected {MANIFEST_NAME} beside {RUN_NAME}, got none; the next run makes its frames anew"
+        raise ManifestError(f"{folder}: {wanted}") from None
     entries, notes = [], []
     if _is_json(lines[-1][:-1]):  # a whole line whose end was changed, not one that was cut short
         notes.append(f"{MANIFEST_NAME}: expected a line end after line {len(lines)}, got {lines[-1][-1:]!r}")

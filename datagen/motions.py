@@ -15,6 +15,7 @@ from torch import Tensor
 import torchblur as tb
 
 Vector = tuple[float, float, float]
+MAX_KINKS = 64  # in one exposure; beyond it no number of segments would follow them
 
 
 @dataclass(frozen=True)
@@ -133,10 +134,11 @@ class PlayedVertices:
         return self.positions[0]
 
     def kinks_s(self, open_s: float, close_s: float) -> list[float]:
-        """Return the times of the sequence's frames strictly inside the window [s]. Source: ours."""
+        """Return the times of the sequence's frames strictly inside the window, MAX_KINKS at most [s]. Source: ours."""
         first = math.floor((open_s + self.start_s) * self.rate_hz) + 1
         last = math.ceil((close_s + self.start_s) * self.rate_hz) - 1
-        times = [k / self.rate_hz - self.start_s for k in range(first, last + 1)]
+        step = max(1, -(-(last + 1 - first) // MAX_KINKS))
+        times = [k / self.rate_hz - self.start_s for k in range(first, last + 1, step)]
         return [t for t in times if open_s < t < close_s]
 
 

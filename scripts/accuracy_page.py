@@ -118,7 +118,9 @@ def write_page(folder: Path, results: dict[str, Any]) -> Path:
         "<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>What accuracy costs in time</title>"
         f"<style>{STYLE}</style></head><body><h1>What accuracy costs in time</h1><p>CPU time of one thread, relative "
         "to the exact frame of the same scene; errors against it. The exact frame itself is drawn at its distance to "
-        f"the mean of many sharp images, which is mostly that mean's own error. {settings}.</p>"
+        "the mean of many sharp images, which is mostly that mean's own error. The exact frame, means, random samples "
+        "and the sharp image that filters start from are compiled; the linear and adaptive ways and the filters "
+        f"themselves are plain torch. {settings}.</p>"
         f"{_figure(svg, 'svg+xml', 'error against time: all scenes')}{_verdicts(results['scenes'])}"
         f"{''.join(parts)}</body></html>"
     )

@@ -117,3 +117,15 @@ def test_each_filter_blurs_a_scene_and_leaves_a_still_one(name):
         else:
             torch.testing.assert_close(images[name], sharp, rtol=0, atol=1e-12)
             torch.testing.assert_close(images[name], exact, rtol=0, atol=1e-12)
+
+
+def test_only_filters_of_curves_refuse_orthographic_cameras():
+    corners = torch.tensor([[-1.0, -1, 0], [1, -1, 0], [0, 1, 0]])
+    camera = tb.Camera.orthographic((0, 0, 3), (0, 0, 0), height_world=4, width=48, height=48, near=0.1, far=9)
+    scene = tb.Scene([tb.Mesh(torch.stack([corners, corners + 1.0]), [[0, 1, 2]])], camera)
+    now = tb.render_instant(scene)
+    for name in ("directional", "mcguire2012", "guertin2014"):
+        image = filter_instant(scene, now, (name,))[0][name]
+        assert float((image - now.rgba[..., :3]).abs().max()) > 0.05, name
+    with pytest.raises(ValueError, match="scene: expected a perspective camera"):
+        filter_instant(scene, now, ("directional", "guertin2015"))

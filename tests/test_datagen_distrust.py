@@ -229,6 +229,44 @@ def test_an_interrupt_while_torch_is_read_is_told_in_a_line(tmp_path):
     assert done.stderr == "interrupted; the same command finishes the rest\n" * 2
 
 
+def test_a_lost_list_or_record_is_damage_and_no_folder_is_wrong_usage(tmp_path, capsys):
+    out = tmp_path / "data"
+    assert generate(parse_spec(TINY), out).is_complete
+    manifest, run = (out / "manifest.jsonl").read_bytes(), (out / "run.json").read_bytes()
+    commands = (["verify", str(out)], ["status", str(out)], ["report", str(out)], ["inspect", str(out), "--frame", "0"])
+    (out / "manifest.jsonl").unlink()
+    for words in commands:
+        assert main(words) == 3, words
+        assert "expected manifest.jsonl beside run.json, got none" in capsys.readouterr().err
+    (out / "manifest.jsonl").write_bytes(manifest)
+    (out / "run.json").write_bytes(run[:-20])
+    for words in commands[:3]:
+        assert main(words) == 3, words
+        assert "run.json" in capsys.readouterr().err
+    assert main(["retry", str(out)]) == 3
+    (out / "run.json").unlink()
+    for words in (["verify", str(tmp_path / "nowhere")], ["verify", str(out / "manifest.jsonl")], ["status", str(out)]):
+        assert main(words) == 2, words
+
+
+def test_a_report_is_not_written_where_there_is_no_folder(tmp_path, capsys):
+    out = tmp_path / "data"
+    assert generate(parse_spec(TINY), out).is_complete
+    assert main(["report", str(out), "--out", str(tmp_path / "none/r.html")]) == 2
+    assert "out: expected a file in a folder that is there" in capsys.readouterr().err
+
+
+def test_a_reader_that_has_read_enough_is_no_error(tmp_path):
+    out = tmp_path / "data"
+    assert generate(parse_spec(TINY), out).is_complete
+    program = "import sys, datagen.__main__ as m, time; time.sleep(0.5); sys.exit(m.main())"
+    words = [sys.executable, "-c", program, "inspect", str(out), "--frame", "0"]
+    with subprocess.Popen(words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as child:
+        child.stdout.close()
+        told = child.stderr.read()
+        assert (child.wait(timeout=60), told) == (0, b"")
+
+
 def test_an_empty_folder_of_shards_hides_no_frame(tmp_path):
     out = tmp_path / "data"
     assert generate(parse_spec(TINY), out).is_complete

@@ -248,6 +248,15 @@ def test_every_wrong_argument_is_named_before_anything_is_written(folder, tmp_pa
         export_dataset(folder, "/proc/out", "gopro")
 
 
+def test_a_smaller_set_is_not_mixed_into_the_export_of_a_larger_one(folder, tmp_path):
+    generate(parse_spec({"width": 4, "height": 4, "count": 3, "rays_per_pixel": 1}), tmp_path / "large")
+    generate(parse_spec({"width": 4, "height": 4, "count": 2, "rays_per_pixel": 1}), tmp_path / "small")
+    for name in ("small", "large", "large"):  # it may grow
+        export_dataset(tmp_path / name, tmp_path / "out", "basicsr")
+    with pytest.raises(ExportError, match=r"folder: expected at least the 3 frames of .*, got 2"):
+        export_dataset(tmp_path / "small", tmp_path / "out", "basicsr")
+
+
 def test_what_a_killed_export_left_is_gone_after_the_next(folder, tmp_path):
     exported(folder, tmp_path, "gopro")
     before = tree(tmp_path / "gopro")

@@ -199,3 +199,13 @@ def test_closed_shapes_are_closed_and_look_outward(shape):
             if points[a] != points[b]:
                 edges[points[a], points[b]] = edges.get((points[a], points[b]), 0) + 1
     assert all(edges.get((b, a)) == n for (a, b), n in edges.items())
+
+
+def test_a_sequence_that_is_played_through_often_is_cut_at_64_of_its_frames_at_most():
+    positions = torch.rand(9, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    for rate_hz, close_s in ((24.0, 1e9), (1e6, 1.0), (64.0, 1.0)):
+        times = PlayedVertices(positions, rate_hz, 0.25).kinks_s(0.0, close_s)
+        assert 32 <= len(times) <= 64
+        assert times == sorted(times)
+        assert 0 < times[0] < times[-1] < close_s
+        assert max(abs((t + 0.25) * rate_hz - round((t + 0.25) * rate_hz)) for t in times) < 1e-3

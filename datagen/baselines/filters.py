@@ -34,14 +34,15 @@ FILTERS: dict[str, tuple[Callable[..., Tensor], dict[str, Any]]] = {
         {"curve": "bezier", "weighting": "published"},
     ),
 }
+NEEDING_PATHS = {"guertin2015"}
 
 
-def apply_filter(name: str, view: View, paths: Paths) -> Tensor:
+def apply_filter(name: str, view: View, paths: Paths | None) -> Tensor:
     """Return the images (B, C, H, W) blurred by a filter at its settings.
 
     Args:
         name: one of FILTERS.
-        view, paths: of the same images; each filter takes what it uses.
+        view, paths: of the same images; each filter takes what it uses: paths, those in NEEDING_PATHS.
 
     Raises:
         KeyError: no such filter.
@@ -64,11 +65,14 @@ def filter_instant(scene: tb.Scene, now: tb.Instant, names: Sequence[str]) -> tu
         {name: (H, W, 3) linear RGB} and {name: settings}, JSON values; `unknown_motion_pixels` counts the pixels that
         were left still because their point is behind the camera at the opening or the closing.
 
+    Raises:
+        ValueError: an orthographic camera, and a filter that needs paths.
+
     Source: ours.
     """
     if not names:
         return {}, {}
     view, unknown = find_view(scene, now)
-    paths = find_paths(scene, now)
+    paths = find_paths(scene, now) if NEEDING_PATHS & set(names) else None
     images = {name: apply_filter(name, view, paths)[0].permute(1, 2, 0) for name in names}
     return images, {name: FILTERS[name][1] | {"unknown_motion_pixels": unknown} for name in names}

@@ -6,6 +6,7 @@ Source: Ronnow et al. 2021 (pipeline).
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -206,18 +207,20 @@ class _Job:
                 prisms, survey, chosen = follow_plan(plan, prisms, survey, self.accuracy)
             work = Work(plan, prisms, survey, chosen)
             exposure = Exposure(scene, self.shutters, self.accuracy, self.memory_bytes, ledger, work, self.backend)
-            total = sum(exposure.image(ray) for ray in pixel_rays(self.rays_per_pixel)) / self.rays_per_pixel
-            return total, plan
+            images = map(exposure.image, pixel_rays(self.rays_per_pixel))
+            total = functools.reduce(torch.add, images)  # a single one is not copied
+            return (total / self.rays_per_pixel if self.rays_per_pixel > 1 else total), plan
 
     def _frame(self, image: Tensor, done: tuple[EffectPlan, dict[str, float]], has_shadows: bool) -> Frame:
         """Return the frame of (H, W, N_LOOKS + M) looks and coverage."""
         scene = self.scene
         rgba, coverage = scene.over_background(image[..., :4]).to(scene.dtype), image[..., N_LOOKS:]
-        due, arriving = image[..., 4:N_LOOKS].unbind(-1)
-        is_due = due > 0
-        shadow = torch.where(is_due, arriving / torch.where(is_due, due, 1.0), 1.0).to(scene.dtype)
+        shadow = None
+        if has_shadows:
+            due, arriving = image[..., 4:N_LOOKS].unbind(-1)
+            is_due = due > 0
+            shadow = torch.where(is_due, arriving / torch.where(is_due, due, 1.0), 1.0).to(scene.dtype)
         for leaf in scene.tensors():  # what nothing depends on has gradient 0, not none
             rgba = rgba + (0 * leaf).sum().to(rgba) if leaf.requires_grad else rgba
-        shadow = shadow if has_shadows else None
         plan, spent = done
         return Frame(rgba, coverage.to(scene.dtype), shadow, self.ledger.counts, self.ledger.timings, spent, plan)

@@ -217,7 +217,7 @@ class Scene:
     def over_background(self, premultiplied: Tensor) -> Tensor:
         """Return (H, W, 4) colour with the background behind it, and opacity, of (H, W, 4) premultiplied. Ours."""
         alpha = premultiplied[..., 3:]
-        rgb = premultiplied[..., :3] + (1 - alpha) * self.background.to(premultiplied)
+        rgb = torch.addcmul(premultiplied[..., :3], 1 - alpha, self.background.to(premultiplied))
         return torch.cat([rgb, alpha], dim=-1)
 
     def tensors(self) -> list[Tensor]:

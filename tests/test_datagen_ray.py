@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from processes import is_running, state_and_parent
+from processes import outlivers, state_and_parent
 from test_datagen_runs import spec, sums
 
 from datagen import SpecError, generate
@@ -91,8 +91,7 @@ def test_killed_workers_and_drivers_lose_nothing_and_nothing_listens_to_others(t
     finally:
         run.kill()
         run.wait()
-    time.sleep(2)
-    assert [pid for pid in family if is_running(pid)] == []
+    assert outlivers(family) == []
     shorter = run_ray(tmp_path / "ray", "--count", "16", **quiet)
     assert shorter.wait(timeout=300) == 0
     mine, whole = sums(tmp_path / "ray"), sums(tmp_path / "one")

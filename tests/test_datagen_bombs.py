@@ -92,20 +92,20 @@ def test_a_long_chain_of_nodes_takes_no_time_and_a_longer_one_or_a_ring_is_refus
         parse_mesh(saved(ring, tmp_path))
 
 
-def white_png(side):
-    """A PNG of `side`² white bits."""
+def png(side, bits, kind, rows):
+    """The bytes of a square PNG of so many bits a channel; kind 0 is grey, 2 RGB; rows as they are stored."""
 
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+    def chunk(name, body):
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
 
-    rows = zlib.compress((b"\0" + b"\xff" * -(-side // 8)) * side, 9)
-    head = struct.pack(">IIBBBBB", side, side, 1, 0, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
+    head = struct.pack(">IIBBBBB", side, side, bits, kind, 0, 0, 0)
+    parts = chunk(b"IHDR", head), chunk(b"IDAT", zlib.compress(rows, 9)), chunk(b"IEND", b"")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
 
 
 def textured(side, count):
     maker = Maker()
-    picture, uv = maker.view(white_png(side)), maker.table(np.zeros((4, 2)))
+    picture, uv = maker.view(png(side, 1, 0, (b"\0" + b"\xff" * -(-side // 8)) * side)), maker.table(np.zeros((4, 2)))
     maker.tree |= {
         "images": [{"bufferView": picture, "mimeType": "image/png"}] * count,
         "textures": [{"source": k} for k in range(count)],

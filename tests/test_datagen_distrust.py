@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from test_datagen_bombs import png
 from test_datagen_runs import ROOT
 
 import datagen.runs
@@ -187,16 +188,7 @@ def test_a_file_of_options_that_cannot_be_read_is_named(tmp_path, capsys, text):
 
 
 def test_pictures_of_16_bits_a_channel_are_refused(tmp_path):
-    import struct
-    import zlib
-
-    def chunk(kind, body):
-        return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-    header = struct.pack(">IIBBBBB", 2, 2, 16, 2, 0, 0, 0)
-    rows = zlib.compress((b"\0" + bytes(12)) * 2)
-    deep = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", rows) + chunk(b"IEND", b"")
-    (tmp_path / "deep.png").write_bytes(deep)
+    (tmp_path / "deep.png").write_bytes(png(2, 16, 2, (b"\0" + bytes(12)) * 2))
     Image.fromarray(np.zeros((2, 2, 3), np.uint8)).save(tmp_path / "good.png")
     roster = survey_photos(tmp_path)
     assert roster.names == ("good.png",)

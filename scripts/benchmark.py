@@ -160,11 +160,15 @@ def plot(curves: list[dict[str, Any]], path: Path) -> None:
     """Draw the curves."""
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(curves), figsize=(4 * len(curves), 3.2), squeeze=False)
-    for axis, curve in zip(axes[0], curves, strict=True):
-        x, y = [r[curve["by"]] for r in curve["rows"]], [r["s"] for r in curve["rows"]]
-        axis.loglog(x, y, marker="o")
-        axis.set(xlabel=curve["by"], ylabel="s", title=f"{curve['curve']}: slope {curve['slope']:.2f}")
+    kinds = list(dict.fromkeys((curve["curve"], curve["by"]) for curve in curves))
+    figure, axes = pyplot.subplots(1, len(kinds), figsize=(4 * len(kinds), 3.2), squeeze=False)
+    for axis, (name, by) in zip(axes[0], kinds, strict=True):
+        for curve in (c for c in curves if (c["curve"], c["by"]) == (name, by)):
+            x, y = [r[by] for r in curve["rows"]], [r["s"] for r in curve["rows"]]
+            axis.loglog(x, y, marker="o", label=f"threads: {curve['threads']}, slope {curve['slope']:.2f}")
+        axis.set(xlabel=by, ylabel="s", title=name)
+        axis.tick_params(axis="x", which="minor", labelbottom=False)
+        axis.legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path)
 

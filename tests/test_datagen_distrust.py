@@ -286,3 +286,21 @@ def test_a_start_that_was_killed_may_be_followed_by_one_with_the_other_storage(t
     if storages[1] != "auto":
         assert [p for p in trees[0] if ".lock" not in p.name] == [p for p in trees[1] if ".lock" not in p.name]
     assert len(BlurDataset(tmp_path / "data")) == 3
+
+
+def test_workers_are_told_whole_paths_as_they_may_start_elsewhere(tmp_path, monkeypatch):
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/a.obj").write_text(TRIANGLE)
+    monkeypatch.chdir(tmp_path)
+    told, real = [], datagen.runs.run_serial
+
+    def run(task, plan_json, folder, indices):
+        told.append(json.loads(plan_json)["spec"]["assets"])
+        monkeypatch.chdir("/")
+        return real(task, plan_json, folder, indices)
+
+    monkeypatch.setattr(datagen.runs, "run_serial", run)
+    spec = parse_spec(TINY | {"count": 1, "source": "meshes", "assets": "meshes", "backend": "torch"})
+    assert generate(spec, tmp_path / "data").is_complete
+    assert told == [str(tmp_path / "meshes")]
+    assert json.loads((tmp_path / "data/run.json").read_text())["spec"]["assets"] == "meshes"

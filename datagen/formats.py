@@ -205,8 +205,8 @@ def _check_numbers(path: Path, tree: dict[str, Any]) -> None:
         for part in _list_in(mesh, "primitives") if isinstance(mesh, dict) else ():
             named = [part.get("indices"), *part["attributes"].values()] if _has_attributes(part) else []
             used += sum(sizes[k] for k in named if type(k) is int and 0 <= k < len(sizes))
-    if max(sum(sizes), used) > MAX_NUMBERS:
-        found = max(sum(sizes), used)
+    found = max(sum(sizes), used)
+    if found > MAX_NUMBERS:
         raise MeshError(path, f"accessors: expected at most {MAX_NUMBERS} numbers in all, got {found}")
 
 

@@ -15,7 +15,7 @@ from typing import Any
 from datagen.spec import DatasetSpec
 from datagen.writer import FrameFileError, baselines_entry
 
-MAX_FILE_BYTES = 2**50  # of a file or a place in it
+MAX_PLACE = 2**50  # bytes of a file or before a place in it
 
 
 def read_listed_file(folder: str | Path, entry: dict[str, Any], path: str) -> bytes:
@@ -47,7 +47,7 @@ def is_listed(file: dict[str, Any]) -> bool:
     Source: ours.
     """
     numbers = [file["bytes"], *([file["offset"]] if "offset" in file else [])]
-    is_number = all(type(n) is int and 0 <= n < MAX_FILE_BYTES for n in numbers)
+    is_number = all(type(n) is int and 0 <= n < MAX_PLACE for n in numbers)
     return is_number and re.fullmatch("[0-9a-f]{64}", file["sha256"]) is not None
 
 

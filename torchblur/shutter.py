@@ -158,12 +158,10 @@ class Shutter:
     def density(self, t: Tensor, line: Tensor) -> Tensor:
         """Return h at the shutter times `t` (n,) for pixels of `line` (n,); at a jump, either value. Source: ours."""
         t = t - self.line_delay * line.to(t.dtype)
-        times = torch.tensor(self.times, dtype=t.dtype, device=t.device)
-        weights = torch.tensor(self.weights, dtype=t.dtype, device=t.device)
-        area = (0.5 * (weights[1:] + weights[:-1]) * times.diff()).sum()
+        times, weights, before = self._pieces(t)
         k = (torch.searchsorted(times, t.detach(), right=True) - 1).clamp(0, len(times) - 2)
         h = weights[k] + (t - times[k]) / times.diff()[k] * weights.diff()[k]
-        return torch.where((t >= self.t_open) & (t <= self.t_close), h / area, 0.0)
+        return torch.where((t >= self.t_open) & (t <= self.t_close), h / before[-1], 0.0)
 
     def time_of(self, share: Tensor) -> Tensor:
         """Return the shutter times (n,) of the first line until which `share` (n,) in [0, 1] of all weight has passed.

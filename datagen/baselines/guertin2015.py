@@ -114,11 +114,8 @@ def guertin2015(
         below_depth = torch.where(stays, depth, below_depth)
     curves, pixel = _trails(paths, moving, curve)
     settings = Lines() if lines is None else lines
-    trails = (
-        _time_fragments(curves, moving.shape[1:])
-        if weighting == "time"
-        else _line_fragments(curves, settings, moving.shape[1:])
-    )
+    size = moving.shape[1:]
+    trails = _time_fragments(curves, size) if weighting == "time" else _line_fragments(curves, settings, size)
     light, alpha = _scatter(image, pixel, below_depth.detach(), trails)
     if weighting == "time":
         return (light + (1 - alpha).clamp(min=0) * below) / alpha.clamp(min=1)
